@@ -1,0 +1,3 @@
+//! The `lanemap` command: serve, replay, evaluate, simulate, demo.
+
+fn main() {}

@@ -1,0 +1,1 @@
+//! Synthetic roads, drives and a lane detector with realistic errors.

@@ -1,0 +1,1 @@
+//! The lanemap viewer: a page and its scripts, embedded at build time.

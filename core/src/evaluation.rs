@@ -1,0 +1,1 @@
+//! The three measures of the paper's tables: map quality, pose error, association.

@@ -1,0 +1,1 @@
+//! Generated types of the lanemap wire protocol (lanemap.v1).

@@ -1,0 +1,1 @@
+//! The lanemap service: ingest, sessions, journal, HTTP.

@@ -1,0 +1,1 @@
+//! End-to-end promises of lanemap, one file per promise.

@@ -1,1 +1,4 @@
 //! The lanemap service: ingest, sessions, journal, HTTP.
+
+pub mod serve;
+pub mod session;

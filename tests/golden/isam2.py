@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Golden values for the incremental smoothing of one lane, from GTSAM's iSAM2.
 
-    python3 -m venv target/venv && target/venv/bin/pip install gtsam==4.3.0 numpy
+    python3 -m venv target/venv && target/venv/bin/pip install -r tests/golden/requirements.txt
     target/venv/bin/python tests/golden/isam2.py            # writes tests/golden/isam2.json
     target/venv/bin/python tests/golden/isam2.py --check    # recomputes, and fails where the file differs
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draw a map beside its truth: the whole of it, and close-ups in which a hook, a double line or a shift can be seen.
 
-    python3 -m venv target/venv && target/venv/bin/pip install matplotlib numpy
+    python3 -m venv target/venv && target/venv/bin/pip install -r tests/plots/requirements.txt
     target/venv/bin/python tests/plots/plot_map.py --map lanes.geojson --truth maps/segment-X.geojson --output map.png
 
 --map is GeoJSON in the drive's metres: `/sessions/{id}/lanes.geojson?crs=local` of a server, as a file or a URL.

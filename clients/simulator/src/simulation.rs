@@ -1,0 +1,267 @@
+//! The whole: a scenario in, a network with several simulated drives out.
+
+use lanemap_core::{Detection, FrameParts, Odometry, Pose, Sequence, TimestampNs};
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+
+use crate::{
+    camera::Camera,
+    detector::{Detector, DetectorModel},
+    drive::{
+        MotionModel, Path, Route, TrueState,
+        motion::{FRAME_PERIOD_NS, FRAME_RATE_HZ},
+    },
+    gnss::GnssModel,
+    odometry::OdometryNoise,
+    random::{Purpose, Seed, SimRng},
+    road::{NetworkPlan, RoadNetwork},
+    view::{LineView, lines_in_view},
+};
+
+/// Time of the first frame of the first drive, nanoseconds since the Unix epoch: 1 January 2025.
+const FIRST_START_NS: i64 = 1_735_689_600_000_000_000;
+/// Time between the starts of drives, nanoseconds: an hour.
+const START_INTERVAL_NS: i64 = 3_600_000_000_000;
+
+/// What to simulate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scenario {
+    /// The seed that fixes everything.
+    pub seed: Seed,
+    /// The roads.
+    pub network: NetworkPlan,
+    /// Steepest slope of the land: 0.05 is 5 %.
+    pub max_grade: f64,
+    /// Number of drives.
+    pub drives: u32,
+    /// Length of each drive, metres; shorter where the road ends.
+    pub length_m: f64,
+    /// Whether all drives take one route (on lanes and at speeds of their own) or each its own.
+    pub shared_route: bool,
+    /// Speed and wander.
+    pub motion: MotionModel,
+    /// The lane detector.
+    pub detector: DetectorModel,
+    /// The noise of the odometry.
+    pub odometry: OdometryNoise,
+    /// The noise of GNSS.
+    pub gnss: GnssModel,
+    /// The camera.
+    pub camera: Camera,
+}
+
+impl Scenario {
+    /// Ten drives of 1.5 km each through a small hilly town.
+    #[must_use]
+    pub fn town(seed: u64) -> Self {
+        Self {
+            seed: Seed(seed),
+            network: NetworkPlan::Grid { columns: 4, rows: 4, spacing_m: 420.0 },
+            max_grade: 0.05,
+            drives: 10,
+            length_m: 1_500.0,
+            shared_route: false,
+            motion: MotionModel::default(),
+            detector: DetectorModel::default(),
+            odometry: OdometryNoise { yaw_sigma_deg: 0.05, translation_sigma_m: 0.02 },
+            gnss: GnssModel::default(),
+            camera: Camera::default(),
+        }
+    }
+
+    /// One drive of `length_m` along one road that never comes back to where it was.
+    #[must_use]
+    pub fn long_road(seed: u64, length_m: f64) -> Self {
+        Self {
+            network: NetworkPlan::Chain { length_m: length_m * 1.1 },
+            drives: 1,
+            length_m,
+            shared_route: true,
+            motion: MotionModel { min_speed_mps: 12.0, max_speed_mps: 22.0, ..MotionModel::default() },
+            ..Self::town(seed)
+        }
+    }
+}
+
+/// A road network and the drives through it.
+#[derive(Debug)]
+pub struct Simulation {
+    /// The roads, with every painted line.
+    pub network: RoadNetwork,
+    /// The drives, in the order of their numbers.
+    pub drives: Vec<SimulatedDrive>,
+}
+
+/// One simulated drive: the truth, and what the vehicle knows of it.
+#[derive(Debug)]
+pub struct SimulatedDrive {
+    /// Number within the simulation.
+    pub number: u32,
+    /// The camera.
+    pub camera: Camera,
+    /// Where the drive's odometry frame truly lies: its origin is below the first pose, its x axis along it.
+    pub world_from_odometry: Pose,
+    /// Noise of the odometry.
+    pub odometry_noise: OdometryNoise,
+    /// Frames at 10 Hz.
+    pub frames: Vec<SimulatedFrame>,
+}
+
+/// One frame of a simulated drive.
+#[derive(Debug)]
+pub struct SimulatedFrame {
+    /// Where the vehicle truly is.
+    pub truth: TrueState,
+    /// What of the road is truly in sight, from left to right.
+    pub views: Vec<LineView>,
+    /// Where the vehicle's odometry has it, in the odometry frame of the drive.
+    pub odometry_from_vehicle: Pose,
+    /// Where GNSS has it, in the world.
+    pub gnss_world_from_vehicle: Pose,
+    /// What the detector reports.
+    pub detections: Vec<Detection>,
+}
+
+impl Simulation {
+    /// Simulates a scenario. The same scenario gives the same simulation, to the byte.
+    #[must_use]
+    pub fn run(scenario: &Scenario) -> Self {
+        let network = RoadNetwork::build(&scenario.network, scenario.max_grade, scenario.seed);
+        let drives = (0..scenario.drives).map(|number| SimulatedDrive::run(scenario, &network, number)).collect();
+        Self { network, drives }
+    }
+}
+
+impl SimulatedDrive {
+    /// Simulates one drive of a scenario through its network.
+    #[must_use]
+    pub fn run(scenario: &Scenario, network: &RoadNetwork, number: u32) -> Self {
+        let seed = scenario.seed;
+        let route = route_of(scenario, network, number);
+        let mut rng = seed.stream(Purpose::Motion, number);
+        let wander = scenario.motion.lateral_wander(&mut rng);
+        let path = Path::along(network, &route, &wander);
+        let start = TimestampNs(FIRST_START_NS + i64::from(number) * START_INTERVAL_NS);
+        let states = scenario.motion.drive(network, &path, scenario.length_m, start, &mut rng);
+        let gnss = scenario.gnss.observe(&states, &mut seed.stream(Purpose::Gnss, number));
+        let (world_from_odometry, odometry) =
+            odometry_of(scenario.odometry, &states, &mut seed.stream(Purpose::Odometry, number));
+        let sensor = scenario.camera.sensor();
+        let mut detector = Detector::new(scenario.detector, sensor, seed.stream(Purpose::Detector, number));
+        let frames = states
+            .into_iter()
+            .zip(gnss)
+            .zip(odometry)
+            .map(|((truth, gnss_world_from_vehicle), odometry_from_vehicle)| {
+                let views = lines_in_view(network, &route.legs, truth.leg, &truth.world_from_vehicle, &sensor);
+                let detections = detector.observe(&views, 1.0 / FRAME_RATE_HZ);
+                SimulatedFrame { truth, views, odometry_from_vehicle, gnss_world_from_vehicle, detections }
+            })
+            .collect();
+        Self { number, camera: scenario.camera, world_from_odometry, odometry_noise: scenario.odometry, frames }
+    }
+
+    /// The frame that the vehicle would stream: what it knows, nothing of the truth. Sequences begin at 1; no GNSS fix.
+    ///
+    /// # Panics
+    /// Where there is no frame `index`.
+    #[must_use]
+    pub fn frame_parts(&self, index: usize) -> FrameParts {
+        let frame = &self.frames[index];
+        FrameParts {
+            sequence: Sequence(index as u64 + 1),
+            time: frame.truth.time,
+            odometry: Odometry {
+                odometry_from_vehicle: frame.odometry_from_vehicle,
+                motion_covariance: Some(self.odometry_noise.motion_covariance()),
+            },
+            gnss: None,
+            detections: frame.detections.clone(),
+        }
+    }
+
+    /// Time from the first to the last frame, seconds.
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        (self.frames.len().saturating_sub(1)) as f64 * FRAME_PERIOD_NS as f64 * 1e-9
+    }
+
+    /// Distance driven, metres.
+    #[must_use]
+    pub fn length_m(&self) -> f64 {
+        self.frames.last().map_or(0.0, |frame| frame.truth.distance_m)
+    }
+}
+
+fn route_of(scenario: &Scenario, network: &RoadNetwork, number: u32) -> Route {
+    // A little farther than asked, so that the last frames have road ahead of them.
+    let length_m = scenario.length_m + 150.0;
+    let rng = &mut scenario.seed.stream(Purpose::Route, number);
+    if !scenario.shared_route {
+        return Route::random(network, length_m, rng);
+    }
+    let first = Route::random(network, length_m, &mut scenario.seed.stream(Purpose::Route, 0));
+    if number == 0 { first } else { first.on_other_lanes(network, rng) }
+}
+
+/// The true place of the odometry frame, and noisy odometry in it.
+fn odometry_of(noise: OdometryNoise, states: &[TrueState], rng: &mut SimRng) -> (Pose, Vec<Pose>) {
+    let Some(first) = states.first() else { return (Pose::identity(), Vec::new()) };
+    let yaw_rad = lanemap_core::geometry::pose::yaw_rad(&first.world_from_vehicle);
+    let world_from_odometry = Pose::from_parts(
+        Translation3::from(first.world_from_vehicle.translation.vector),
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad),
+    );
+    let odometry_from_world = world_from_odometry.inverse();
+    let exact: Vec<Pose> = states.iter().map(|state| odometry_from_world * state.world_from_vehicle).collect();
+    (world_from_odometry, noise.apply(&exact, rng))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use lanemap_core::{Frame, FrameLimits};
+
+    fn short(seed: u64) -> Scenario {
+        Scenario { drives: 2, length_m: 300.0, ..Scenario::town(seed) }
+    }
+
+    #[test]
+    fn every_frame_is_one_that_the_mapper_takes() {
+        for drive in &Simulation::run(&short(1)).drives {
+            assert!(drive.frames.len() > 150);
+            for index in 0..drive.frames.len() {
+                Frame::new(drive.frame_parts(index), &FrameLimits::default()).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn one_seed_repeats_and_two_seeds_differ() {
+        let frames = |seed| {
+            let simulation = Simulation::run(&short(seed));
+            simulation.drives.iter().flat_map(|drive| (0..150).map(|k| drive.frame_parts(k))).collect::<Vec<_>>()
+        };
+        assert_eq!(frames(1), frames(1));
+        assert_ne!(frames(1), frames(2));
+    }
+
+    #[test]
+    fn one_more_drive_leaves_the_others_as_they_were() {
+        let two = Simulation::run(&short(1));
+        let three = Simulation::run(&Scenario { drives: 3, ..short(1) });
+        assert_eq!(two.drives[1].frame_parts(100), three.drives[1].frame_parts(100));
+    }
+
+    #[test]
+    fn odometry_starts_below_the_first_pose_and_drifts_from_the_truth() {
+        let simulation = Simulation::run(&short(4));
+        let drive = &simulation.drives[0];
+        let error_m = |frame: &SimulatedFrame| {
+            let believed = drive.world_from_odometry * frame.odometry_from_vehicle;
+            (believed.translation.vector - frame.truth.world_from_vehicle.translation.vector).norm()
+        };
+        assert!(error_m(&drive.frames[0]) < 1e-9);
+        let last = error_m(&drive.frames[drive.frames.len() - 1]);
+        assert!(last > 0.05 && last < 20.0, "{last}");
+    }
+}

@@ -1,6 +1,7 @@
 //! The camera of a simulated vehicle: where it sits and what falls into its image.
 
-use lanemap_core::{FieldOfView, Pose, Sensor};
+use lanemap_core::{Pose, Sensor};
+use lanemap_openlane::Intrinsic;
 use nalgebra::{Translation3, UnitQuaternion};
 
 /// A pinhole camera on the vehicle. Axes: x forward along the optical axis, y left, z up.
@@ -8,12 +9,8 @@ use nalgebra::{Translation3, UnitQuaternion};
 pub struct Camera {
     /// Mount.
     pub vehicle_from_camera: Pose,
-    /// Focal length, pixels.
-    pub focal_px: f64,
-    /// Principal point, pixels from the left; the image is twice as wide.
-    pub centre_u_px: f64,
-    /// Principal point, pixels from the top; the image is twice as high.
-    pub centre_v_px: f64,
+    /// Focal length and principal point; the image is twice as wide and high as the principal point says.
+    pub intrinsic: Intrinsic,
 }
 
 impl Default for Camera {
@@ -24,9 +21,7 @@ impl Default for Camera {
                 Translation3::new(1.54, -0.02, 2.115),
                 UnitQuaternion::from_euler_angles(0.0, 0.004, 0.002),
             ),
-            focal_px: 2060.0,
-            centre_u_px: 960.0,
-            centre_v_px: 640.0,
+            intrinsic: Intrinsic { fx: 2060.0, fy: 2060.0, cx: 960.0, cy: 640.0 },
         }
     }
 }
@@ -35,15 +30,6 @@ impl Camera {
     /// What a session declares of this camera.
     #[must_use]
     pub fn sensor(&self) -> Sensor {
-        let (horizontal, vertical) = (self.centre_u_px / self.focal_px, self.centre_v_px / self.focal_px);
-        Sensor {
-            vehicle_from_sensor: self.vehicle_from_camera,
-            field_of_view: Some(FieldOfView {
-                tan_left: horizontal,
-                tan_right: horizontal,
-                tan_up: vertical,
-                tan_down: vertical,
-            }),
-        }
+        Sensor { vehicle_from_sensor: self.vehicle_from_camera, field_of_view: Some(self.intrinsic.field_of_view()) }
     }
 }

@@ -50,6 +50,7 @@ struct FrameTilt {
 
 impl Detector {
     /// A detector at the start of a drive.
+    #[must_use]
     pub fn new(model: DetectorModel, sensor: Sensor, mut rng: SimRng) -> Self {
         let pitch = PartlyConstant::stationary(model.constant_share, &mut rng);
         let yaw = PartlyConstant::stationary(model.constant_share, &mut rng);

@@ -10,7 +10,7 @@
 //!
 //! let scenario = Scenario { drives: 1, length_m: 200.0, ..Scenario::town(7) };
 //! let simulation = Simulation::run(&scenario);
-//! assert!(simulation.drives[0].frame_parts(0).detections.len() <= 16);
+//! assert!(simulation.drives[0].frame_parts(0, None).detections.len() <= 16);
 //! ```
 
 pub mod camera;
@@ -19,9 +19,11 @@ pub mod drive;
 pub mod gnss;
 pub mod noise;
 pub mod odometry;
+pub mod openlane;
 pub mod random;
 pub mod road;
 pub mod simulation;
+pub mod truth_map;
 pub mod view;
 
 pub use camera::Camera;

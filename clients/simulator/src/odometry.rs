@@ -1,12 +1,12 @@
-//! Odometry noise: each true relative motion is followed by a yaw and a shift of its own, and the results are chained.
+//! Odometry: true motion followed by the paper's 3-DOF noise, and what the vehicle says of its uncertainty.
 //!
 //! `T'_k = T'_{k-1} (T_{k-1}^-1 T_k) N_k`, `N_k` a yaw `N(0, sigma_yaw)` and an x, y shift `N(0, sigma_translation)` in
-//! the moving frame: the paper's 3-DOF noise between every two frames.
+//! the moving frame ([`lanemap_openlane::noisy_odometry`]).
 
 use lanemap_core::{Pose, TangentCovariance, geometry::pose::covariance_from_sigmas};
-use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use lanemap_openlane::noisy_odometry;
 
-use crate::random::{SimRng, normal};
+use crate::random::SimRng;
 
 /// What is left of the noise on the axes that the model does not disturb: metres, and radians.
 const RESIDUAL_M: f64 = 0.01;
@@ -32,20 +32,7 @@ impl OdometryNoise {
 
     /// Noisy poses from true ones; the first is kept.
     pub fn apply(&self, true_poses: &[Pose], rng: &mut SimRng) -> Vec<Pose> {
-        let Some(first) = true_poses.first() else { return Vec::new() };
-        let mut noisy = vec![*first];
-        for pair in true_poses.windows(2) {
-            let motion = pair[0].inverse() * pair[1];
-            let next = noisy[noisy.len() - 1] * motion * self.draw(rng);
-            noisy.push(next);
-        }
-        noisy
-    }
-
-    fn draw(&self, rng: &mut SimRng) -> Pose {
-        let yaw_rad = self.yaw_sigma_deg.to_radians() * normal(rng);
-        let shift = Vector3::new(normal(rng), normal(rng), 0.0) * self.translation_sigma_m;
-        Pose::from_parts(Translation3::from(shift), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad))
+        noisy_odometry(true_poses, self.yaw_sigma_deg, self.translation_sigma_m, rng)
     }
 }
 
@@ -54,6 +41,7 @@ mod tests {
     use super::*;
     use crate::random::{Purpose, Seed};
     use lanemap_core::geometry::pose::log;
+    use nalgebra::{Translation3, UnitQuaternion};
 
     #[test]
     fn each_motion_is_off_by_the_stated_noise_and_by_nothing_else() {

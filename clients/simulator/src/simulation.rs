@@ -1,6 +1,8 @@
 //! The whole: a scenario in, a network with several simulated drives out.
 
-use lanemap_core::{Detection, FrameParts, Odometry, Pose, Sequence, TimestampNs};
+use lanemap_core::{
+    Detection, FrameParts, Odometry, Pose, Sequence, TimestampNs, geometry::georeference::Georeference,
+};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
 use crate::{
@@ -21,6 +23,8 @@ use crate::{
 const FIRST_START_NS: i64 = 1_735_689_600_000_000_000;
 /// Time between the starts of drives, nanoseconds: an hour.
 const START_INTERVAL_NS: i64 = 3_600_000_000_000;
+/// Standard deviation that the receiver states, horizontal and vertical, metres: that of its bias.
+const GNSS_SIGMA_M: f64 = 1.0;
 
 /// What to simulate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -160,12 +164,14 @@ impl SimulatedDrive {
         Self { number, camera: scenario.camera, world_from_odometry, odometry_noise: scenario.odometry, frames }
     }
 
-    /// The frame that the vehicle would stream: what it knows, nothing of the truth. Sequences begin at 1; no GNSS fix.
+    /// The frame that the vehicle would stream: what it knows, nothing of the truth. Sequences begin at 1.
+    ///
+    /// With `world_on_earth`, which puts the simulation's world on the earth, the frame has a GNSS fix.
     ///
     /// # Panics
     /// Where there is no frame `index`.
     #[must_use]
-    pub fn frame_parts(&self, index: usize) -> FrameParts {
+    pub fn frame_parts(&self, index: usize, world_on_earth: Option<&Georeference>) -> FrameParts {
         let frame = &self.frames[index];
         FrameParts {
             sequence: Sequence(index as u64 + 1),
@@ -174,7 +180,7 @@ impl SimulatedDrive {
                 odometry_from_vehicle: frame.odometry_from_vehicle,
                 motion_covariance: Some(self.odometry_noise.motion_covariance()),
             },
-            gnss: None,
+            gnss: world_on_earth.map(|world| world.fix_at(&frame.gnss_world_from_vehicle, GNSS_SIGMA_M, GNSS_SIGMA_M)),
             detections: frame.detections.clone(),
         }
     }
@@ -230,7 +236,7 @@ mod tests {
         for drive in &Simulation::run(&short(1)).drives {
             assert!(drive.frames.len() > 150);
             for index in 0..drive.frames.len() {
-                Frame::new(drive.frame_parts(index), &FrameLimits::default()).unwrap();
+                Frame::new(drive.frame_parts(index, None), &FrameLimits::default()).unwrap();
             }
         }
     }
@@ -239,7 +245,7 @@ mod tests {
     fn one_seed_repeats_and_two_seeds_differ() {
         let frames = |seed| {
             let simulation = Simulation::run(&short(seed));
-            simulation.drives.iter().flat_map(|drive| (0..150).map(|k| drive.frame_parts(k))).collect::<Vec<_>>()
+            simulation.drives.iter().flat_map(|drive| (0..150).map(|k| drive.frame_parts(k, None))).collect::<Vec<_>>()
         };
         assert_eq!(frames(1), frames(1));
         assert_ne!(frames(1), frames(2));
@@ -249,7 +255,7 @@ mod tests {
     fn one_more_drive_leaves_the_others_as_they_were() {
         let two = Simulation::run(&short(1));
         let three = Simulation::run(&Scenario { drives: 3, ..short(1) });
-        assert_eq!(two.drives[1].frame_parts(100), three.drives[1].frame_parts(100));
+        assert_eq!(two.drives[1].frame_parts(100, None), three.drives[1].frame_parts(100, None));
     }
 
     #[test]

@@ -98,7 +98,6 @@ impl LineHabits {
 pub fn mistaken(category: Category, rng: &mut SimRng) -> Category {
     use Category as C;
     let likely: &[C] = match category {
-        C::WhiteDashed => &[C::WhiteSolid],
         C::WhiteSolid => &[C::WhiteDashed, C::RightCurb, C::YellowSolid],
         C::YellowDashed => &[C::YellowSolid, C::WhiteDashed],
         C::YellowSolid => &[C::DoubleYellowSolid, C::YellowDashed, C::WhiteSolid],

@@ -6,6 +6,7 @@ use crate::{detector::model::ROWS_M, view::LineView};
 
 /// A line at one row of the ground frame, metres.
 #[derive(Clone, Copy, Debug)]
+#[expect(clippy::struct_field_names, reason = "the postfix is the unit")]
 pub struct Row {
     /// Ahead, below the camera.
     pub range_m: f64,

@@ -1,1 +1,23 @@
-//! association
+//! Which detection is which lane of the map.
+//!
+//! [`chamfer`] + [`consistency`] + [`assignment`] are the paper's method; [`joint`] is ours, which estimates the error of the
+//! pose together with the matching. Both look at [`LaneShape`]s, so that they serve the mapper and the paper's table alike.
+
+pub mod assignment;
+pub mod chamfer;
+pub mod consistency;
+pub mod joint;
+pub mod shape;
+
+pub use chamfer::associate_by_chamfer;
+pub use joint::associate_jointly;
+pub use shape::LaneShape;
+
+/// Uncertainty of the pose with which detections were brought among the lanes of the map.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseUncertainty {
+    /// Standard deviation of the heading, radians.
+    pub yaw_rad: f64,
+    /// Standard deviation of the position along and across the road, metres each.
+    pub position_m: f64,
+}

@@ -1,22 +1,52 @@
 //! The mapper: one vehicle's frames in, one drive's lane map out.
+//!
+//! [`Mapper::step`] is the paper's pipeline (figure 2) in its order: predict, observe, associate, correct the pose, then
+//! smooth, grow and begin lanes, and judge what exists.
 
+mod local_map;
+mod scene;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    association::{LaneShape, PoseUncertainty, associate_by_chamfer, associate_jointly},
     error::SnapshotError,
-    frame::{Frame, Sequence},
-    geometry::{Pose, TangentCovariance},
+    frame::{Frame, Sequence, TimestampNs},
+    geometry::{
+        Pose, TangentCovariance,
+        georeference::{Georeference, GeoreferenceFit},
+    },
+    landmark::{Landmark, duplicate, index::LaneIndex, lane::map_samples},
     lane_map::{LaneId, LaneMap, LocalLane, LocalWindow},
-    params::Params,
+    observation::{LaneObservation, observe},
+    params::{Params, Preset},
     sensor::Sensor,
+    tracking::{PoseEstimate, update_pose},
 };
+use scene::Scene;
+
+/// Version of the bytes that [`Mapper::snapshot`] writes.
+const SNAPSHOT_VERSION: u16 = 1;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Mapper {
     params: Params,
     sensor: Sensor,
-    map_from_vehicle: Pose,
+    pose: PoseEstimate,
+    /// Odometry of the last frame; `None` before the first.
+    odometry_from_vehicle: Option<Pose>,
+    lanes: BTreeMap<LaneId, Landmark>,
+    index: LaneIndex,
+    last_lane: u64,
+    /// Lanes that the last frame saw.
+    seen_now: Vec<LaneId>,
+    georeference: GeoreferenceFit,
 }
 
 /// A detection that was taken for a lane of the map.
@@ -51,27 +81,249 @@ impl Mapper {
     /// A mapper that knows nothing yet. Its map frame is the odometry frame of the drive at the first frame.
     #[must_use]
     pub fn new(params: Params, sensor: Sensor) -> Self {
-        Self { params, sensor, map_from_vehicle: Pose::identity() }
+        Self {
+            params,
+            sensor,
+            pose: PoseEstimate::first(Pose::identity()),
+            odometry_from_vehicle: None,
+            lanes: BTreeMap::new(),
+            index: LaneIndex::default(),
+            last_lane: 0,
+            seen_now: Vec::new(),
+            georeference: GeoreferenceFit::default(),
+        }
     }
 
     /// Takes one frame. Frames come in the order of their sequence; the caller sees to that.
     pub fn step(&mut self, frame: &Frame) -> StepReport {
-        self.map_from_vehicle = frame.odometry().odometry_from_vehicle;
-        StepReport {
+        let predicted = self.predict(frame);
+        let observations = self.observe(frame);
+        let scene = Scene::around(&predicted.map_from_vehicle, &self.lanes, &self.index, &self.params);
+        let matching = self.associate(&observations, &scene, &predicted);
+        self.pose = self.correct_pose(&observations, &scene, &matching, &predicted);
+        let mut report = self.update_lanes(frame, &observations, &scene, &matching.lane_of);
+        report.dropped = self.judge_existence(&scene);
+        report.dropped.extend(self.join_duplicates(&scene));
+        if let Some(fix) = frame.gnss() {
+            self.georeference.observe(fix, &self.pose.map_from_vehicle);
+        }
+        report
+    }
+
+    fn predict(&mut self, frame: &Frame) -> PoseEstimate {
+        let odometry = frame.odometry();
+        let previous = self.odometry_from_vehicle.replace(odometry.odometry_from_vehicle);
+        match previous {
+            Some(previous) => self.pose.predict(&previous, odometry, &self.params.tracking),
+            None => PoseEstimate::first(odometry.odometry_from_vehicle),
+        }
+    }
+
+    fn observe(&self, frame: &Frame) -> Vec<LaneObservation> {
+        let detections = frame.detections().iter().enumerate();
+        detections
+            .filter_map(|(index, detection)| observe(detection, index, &self.sensor, &self.params.observation))
+            .collect()
+    }
+
+    fn associate(&self, observations: &[LaneObservation], scene: &Scene, predicted: &PoseEstimate) -> Matching {
+        let params = &self.params.association;
+        let detections: Vec<LaneShape> = observations
+            .iter()
+            .map(|observation| {
+                let points = observation.samples.iter().map(|sample| sample.point_vehicle).collect();
+                LaneShape::seen_once(observation.category, points, params.category_confusion)
+            })
+            .collect();
+        let sigma = |a: usize, b: usize| (predicted.covariance[(a, a)].max(predicted.covariance[(b, b)])).sqrt();
+        let uncertainty = PoseUncertainty { yaw_rad: sigma(5, 5), position_m: sigma(0, 1) };
+        match self.params.preset {
+            Preset::Paper => {
+                let lane_of = associate_by_chamfer(&detections, &scene.shapes, &uncertainty, params, true);
+                Matching { lane_of, start: predicted.map_from_vehicle }
+            }
+            Preset::Default => {
+                let found = associate_jointly(&detections, &scene.shapes, &uncertainty, params);
+                let start = scene::displaced(&predicted.map_from_vehicle, &found.pose_error);
+                Matching { lane_of: found.lane_of, start }
+            }
+        }
+    }
+
+    fn correct_pose(
+        &self,
+        observations: &[LaneObservation],
+        scene: &Scene,
+        matching: &Matching,
+        predicted: &PoseEstimate,
+    ) -> PoseEstimate {
+        let matched = scene.matched_lanes(observations, &matching.lane_of, &self.lanes, &self.params);
+        if matched.is_empty() {
+            return *predicted;
+        }
+        update_pose(predicted, &matching.start, &matched, &self.params.tracking)
+    }
+
+    fn update_lanes(
+        &mut self,
+        frame: &Frame,
+        observations: &[LaneObservation],
+        scene: &Scene,
+        lane_of: &[Option<usize>],
+    ) -> StepReport {
+        let mut report = StepReport {
             sequence: frame.sequence(),
             associated: Vec::new(),
             born: Vec::new(),
             grown: Vec::new(),
             dropped: Vec::new(),
-            map_from_vehicle: self.map_from_vehicle,
-            covariance: TangentCovariance::zeros(),
+            map_from_vehicle: self.pose.map_from_vehicle,
+            covariance: self.pose.covariance,
+        };
+        self.seen_now.clear();
+        for (observation, shape) in observations.iter().zip(lane_of) {
+            let detection = observation.detection;
+            if let Some(lane) = shape.map(|shape| scene.runs[shape].lane) {
+                if self.extend_lane(lane, observation, frame.time()) {
+                    report.grown.push(lane);
+                }
+                report.associated.push(AssociatedDetection { detection, lane });
+            } else if let Some(lane) = self.begin_lane(observation, frame.time()) {
+                report.born.push(AssociatedDetection { detection, lane });
+            }
+        }
+        report
+    }
+
+    /// Takes an associated observation into its lane; whether the lane became longer.
+    fn extend_lane(&mut self, id: LaneId, observation: &LaneObservation, time: TimestampNs) -> bool {
+        let Some(lane) = self.lanes.get_mut(&id) else { return false };
+        let params = &self.params.landmark;
+        let grown = lane.grow(observation, &self.pose.map_from_vehicle, params);
+        Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, &self.sensor, &self.params);
+        self.seen_now.push(id);
+        let (first, last) = scene::near_knots(lane, &self.pose.map_from_vehicle, observation);
+        self.index.update(id, lane.information(), first, last);
+        grown
+    }
+
+    /// Begins a lane with an observation that is none of the map's.
+    fn begin_lane(&mut self, observation: &LaneObservation, time: TimestampNs) -> Option<LaneId> {
+        let id = LaneId(self.last_lane + 1);
+        let pose = &self.pose.map_from_vehicle;
+        let mut lane = Landmark::begin(id, observation, pose, time, &self.params.landmark)?;
+        self.last_lane += 1;
+        Self::take_in(&mut lane, observation, time, pose, &self.sensor, &self.params);
+        let (first, last) = lane.knots();
+        self.index.update(id, lane.information(), first, last);
+        self.lanes.insert(id, lane);
+        self.seen_now.push(id);
+        Some(id)
+    }
+
+    /// What every observation does to its lane: smooth it, vote on its extent and category, raise its existence.
+    fn take_in(
+        lane: &mut Landmark,
+        observation: &LaneObservation,
+        time: TimestampNs,
+        map_from_vehicle: &Pose,
+        sensor: &Sensor,
+        params: &Params,
+    ) {
+        let camera = Point3::from(sensor.ground_offset());
+        let near = scene::near_knots(lane, map_from_vehicle, observation);
+        lane.smooth(map_samples(observation, map_from_vehicle, &camera, &params.landmark), near, &params.landmark);
+        let visibility = |point: &Point3<f64>| {
+            scene::visibility(&map_from_vehicle.inverse_transform_point(point), sensor, &params.observation)
+        };
+        lane.vote_extent(observation, map_from_vehicle, near, visibility, &params.landmark);
+        lane.category.vote(observation.category);
+        lane.existence.seen(0.85);
+        lane.observations += 1;
+        lane.last_seen = time;
+    }
+
+    /// Lowers the existence of lanes that this frame should have seen, and gives up those that are not there.
+    fn judge_existence(&mut self, scene: &Scene) -> Vec<LaneId> {
+        if self.params.preset == Preset::Paper {
+            return Vec::new();
+        }
+        let mut dropped = Vec::new();
+        for run in &scene.runs {
+            if self.seen_now.contains(&run.lane) {
+                continue;
+            }
+            let Some(lane) = self.lanes.get_mut(&run.lane) else { continue };
+            let chance = scene::detection_probability(lane, run, &self.pose.map_from_vehicle, &self.sensor, &self.params);
+            lane.existence.missed(chance);
+            if lane.existence.probability() < 0.05 {
+                dropped.push(run.lane);
+            }
+        }
+        for id in &dropped {
+            self.forget(*id);
+        }
+        dropped
+    }
+
+    fn forget(&mut self, id: LaneId) {
+        self.lanes.remove(&id);
+        self.index.remove(id);
+        self.seen_now.retain(|seen| *seen != id);
+    }
+
+    /// Joins lanes that turned out to be one; the younger goes into the older.
+    fn join_duplicates(&mut self, scene: &Scene) -> Vec<LaneId> {
+        if self.params.preset == Preset::Paper {
+            return Vec::new();
+        }
+        let mut joined = Vec::new();
+        for (position, old_run) in scene.runs.iter().enumerate() {
+            for young_run in &scene.runs[position + 1..] {
+                let (old, young) = (old_run.lane, young_run.lane);
+                let (old_seen, young_seen) = (self.seen_now.contains(&old), self.seen_now.contains(&young));
+                if joined.contains(&old) || joined.contains(&young) || (!old_seen && !young_seen) {
+                    continue;
+                }
+                if self.run_together(old_run, young_run) && self.judge_pair(old, young, old_seen && young_seen) {
+                    self.join(old, young);
+                    joined.push(young);
+                }
+            }
+        }
+        joined
+    }
+
+    fn run_together(&self, old: &crate::landmark::index::NearbyRun, young: &crate::landmark::index::NearbyRun) -> bool {
+        let (Some(a), Some(b)) = (self.lanes.get(&old.lane), self.lanes.get(&young.lane)) else { return false };
+        let params = &self.params.landmark;
+        let overlap = duplicate::overlap(b, (young.first, young.last), a, (old.first, old.last), params);
+        overlap.is_some_and(|(share, distance_m)| share > 0.7 && distance_m < 0.6)
+    }
+
+    fn judge_pair(&mut self, old: LaneId, young: LaneId, both_seen: bool) -> bool {
+        self.lanes.get_mut(&young).is_some_and(|lane| duplicate::judge(lane, old, both_seen))
+    }
+
+    fn join(&mut self, old: LaneId, young: LaneId) {
+        let Some(other) = self.lanes.remove(&young) else { return };
+        self.index.remove(young);
+        let seen = self.seen_now.contains(&young);
+        self.seen_now.retain(|id| *id != young);
+        if let Some(lane) = self.lanes.get_mut(&old) {
+            lane.absorb(&other, &self.params.landmark);
+            let (first, last) = lane.knots();
+            self.index.update(old, lane.information(), first, last);
+            if seen {
+                self.seen_now.push(old);
+            }
         }
     }
 
     /// Corrected pose of the vehicle at the last frame.
     #[must_use]
     pub fn map_from_vehicle(&self) -> Pose {
-        self.map_from_vehicle
+        self.pose.map_from_vehicle
     }
 
     /// Parameters of this mapper.
@@ -80,22 +332,30 @@ impl Mapper {
         &self.params
     }
 
-    /// Every lane of the drive that is worth showing.
+    /// Where on the earth the map frame lies, once GNSS fixes have determined it.
+    #[must_use]
+    pub fn georeference(&self) -> Option<Georeference> {
+        self.georeference.georeference()
+    }
+
+    /// Every lane of the drive that is worth showing, in the order of birth.
     #[must_use]
     pub fn lane_map(&self) -> LaneMap {
-        LaneMap::default()
+        let shown = self.lanes.values().filter(|lane| local_map::is_shown(lane, &self.params));
+        LaneMap { lanes: shown.filter_map(|lane| local_map::map_lane(lane, &self.params)).collect() }
     }
 
     /// The map around the vehicle at the last frame, in its own axes.
     #[must_use]
-    pub fn local_map(&self, _window: &LocalWindow) -> Vec<LocalLane> {
-        Vec::new()
+    pub fn local_map(&self, window: &LocalWindow) -> Vec<LocalLane> {
+        local_map::local_map(self, window)
     }
 
     /// The whole state as bytes; [`Mapper::restore`] goes on from there as if nothing had happened.
     #[must_use]
     pub fn snapshot(&self) -> Vec<u8> {
-        postcard::to_stdvec(self).unwrap_or_default()
+        // Writing to memory fails only for types that postcard cannot hold, and a mapper has none of them (tested).
+        postcard::to_stdvec(&(SNAPSHOT_VERSION, self)).unwrap_or_default()
     }
 
     /// A mapper from the bytes of [`Mapper::snapshot`].
@@ -103,6 +363,18 @@ impl Mapper {
     /// # Errors
     /// Bytes of another format version, or that do not decode.
     pub fn restore(bytes: &[u8]) -> Result<Self, SnapshotError> {
-        Ok(postcard::from_bytes(bytes)?)
+        let (found, rest): (u16, &[u8]) = postcard::take_from_bytes(bytes)?;
+        if found != SNAPSHOT_VERSION {
+            return Err(SnapshotError::Version { found, expected: SNAPSHOT_VERSION });
+        }
+        Ok(postcard::from_bytes(rest)?)
     }
+}
+
+/// What association found.
+struct Matching {
+    /// For each observation the index of its lane in the scene.
+    lane_of: Vec<Option<usize>>,
+    /// The pose at which the frame fits best, where the pose update starts.
+    start: Pose,
 }

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::lane_map::EndRule;
+
 /// Which mapper to run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Preset {
@@ -17,12 +19,277 @@ pub enum Preset {
 pub struct Params {
     /// The preset that these parameters came from.
     pub preset: Preset,
+    /// From detection to observation.
+    pub observation: ObservationParams,
+    /// From observation to lane of the map.
+    pub association: AssociationParams,
+    /// Correction of the pose.
+    pub tracking: TrackingParams,
+    /// Growth and smoothing of a lane.
+    pub landmark: LandmarkParams,
+}
+
+/// Standard deviation of a detection: `near + growth * (range / reference_range)^exponent`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RangeNoise {
+    /// At the camera, metres.
+    pub near_m: f64,
+    /// Growth up to the reference range, metres.
+    pub growth_m: f64,
+    /// Range at which the growth is reached, metres.
+    pub reference_range_m: f64,
+    /// 1: linear in range.
+    pub exponent: f64,
+}
+
+/// Parameters of [`crate::observation::observe`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ObservationParams {
+    /// Near border of the crop box, metres ahead of the camera.
+    pub ahead_from_m: f64,
+    /// Far border of the crop box, metres ahead of the camera.
+    pub ahead_to_m: f64,
+    /// Left and right border of the crop box, metres.
+    pub side_m: f64,
+    /// Least distance of two points along the line, metres.
+    pub thin_m: f64,
+    /// Fewer points than this are no observation.
+    pub least_points: usize,
+    /// A shorter line is no observation, metres.
+    pub least_length_m: f64,
+    /// Below this spread the line counts as flat in that axis, metres.
+    pub flat_spread_m: f64,
+    /// Order of a flat line.
+    pub flat_order: usize,
+    /// Below this spread the order is 2, above it 3, metres.
+    pub curved_spread_m: f64,
+    /// Whether points weigh by the inverse variance of their range.
+    pub weighted_fit: bool,
+    /// Residuals below this are never outliers, metres.
+    pub outlier_floor_m: f64,
+    /// Distance of two samples, metres.
+    pub sample_step_m: f64,
+    /// Noise of a detection.
+    pub noise: RangeNoise,
+}
+
+/// Parameters of [`crate::association`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AssociationParams {
+    /// Least pose uncertainty that enters the bound on point distances, radians.
+    pub least_sigma_rad: f64,
+    /// Least pose uncertainty that enters the bound on point distances, metres.
+    pub least_sigma_m: f64,
+    /// Floor of the bound on a point's distance, metres (`paper`; the authors' code: 1.0).
+    pub least_bound_m: f64,
+    /// Detection noise in the bound, metres (`paper`; the authors' code: 0.5).
+    pub bound_noise_m: f64,
+    /// Lateral noise of a detection against the map (`default`).
+    pub noise: RangeNoise,
+    /// Independent witnesses in one detected line (`default`).
+    pub witnesses: f64,
+    /// Cost of leaving a detection without a lane, in units of half a squared sigma (`default`).
+    pub unassigned_cost: f64,
+    /// Cost of an expected lane that no detection takes (`default`).
+    pub missed_cost: f64,
+    /// Largest root mean square lateral distance of a match, metres (`default`).
+    pub gate_m: f64,
+    /// Largest mean height difference of a match, metres (`default`).
+    pub gate_height_m: f64,
+    /// Least overlap of a match, metres along the lane (`default`).
+    pub least_overlap_m: f64,
+    /// Overlap from which on a line counts as all its witnesses, metres (`default`).
+    pub full_overlap_m: f64,
+    /// How far a point may lie beyond the end of a lane and still be compared, metres (`default`).
+    pub end_slack_m: f64,
+    /// Range at which a yaw error counts as a shift, metres (`default`).
+    pub play_range_m: f64,
+    /// Below this play of the pose only the predicted pose is tried, metres (`default`).
+    pub single_hypothesis_m: f64,
+    /// Lanes of the map through this box should be seen: near border, metres ahead (`default`).
+    pub expected_from_m: f64,
+    /// Far border of that box, metres ahead (`default`).
+    pub expected_to_m: f64,
+    /// Half the width of that box, metres (`default`).
+    pub expected_side_m: f64,
+    /// Probability that a detector names a wrong category (`default`).
+    pub category_confusion: f64,
+}
+
+/// Parameters of [`crate::tracking`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrackingParams {
+    /// Most iterations of Levenberg-Marquardt.
+    pub iterations: usize,
+    /// Distance of two points that enter, along a line, metres.
+    pub point_step_m: f64,
+    /// Huber threshold, in sigmas.
+    pub huber_sigmas: f64,
+    /// Constant part of a line's lateral and vertical error in one frame, metres.
+    pub line_offset_sigma_m: f64,
+    /// Error of a line's direction in one frame, radians.
+    pub line_slope_sigma_rad: f64,
+    /// Error of a line's bend in one frame: deviation at the reference range, metres.
+    pub line_bend_sigma_m: f64,
+    /// Yaw error that all lines of a frame share, radians.
+    pub frame_yaw_sigma_rad: f64,
+    /// Pitch error that all lines of a frame share, radians.
+    pub frame_pitch_sigma_rad: f64,
+    /// Noise of a single point, metres.
+    pub point_sigma_m: f64,
+    /// Eigenvalues of the lanes' information below this share of the odometry's leave the direction to odometry.
+    pub weak_direction: f64,
+    /// Odometry noise where the vehicle gives none: translation per frame, metres.
+    pub odometry_sigma_m: f64,
+    /// Odometry noise where the vehicle gives none: rotation per frame, radians.
+    pub odometry_sigma_rad: f64,
+}
+
+/// Parameters of [`crate::landmark`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LandmarkParams {
+    /// Distance of two control points, metres (paper: 3).
+    pub chord_m: f64,
+    /// How a curve ends.
+    pub ends: EndRule,
+    /// Standard deviation of a chordal term, metres (paper: 1).
+    pub chord_sigma_m: f64,
+    /// Standard deviation of a second difference of control points, metres; infinite: no such term.
+    pub bend_sigma_m: f64,
+    /// Independent witnesses in one detected line: each sample's information is divided so that they sum to this.
+    pub witnesses: f64,
+    /// Huber threshold of a sample, metres (authors: 0.5).
+    pub huber_m: f64,
+    /// Frames whose weights and foot points are evaluated anew before they are folded for good.
+    pub window_frames: usize,
+    /// Every n-th sample enters the map.
+    pub sample_stride: usize,
+    /// Lanes seen in fewer frames than this are not shown.
+    pub least_observations: u32,
+    /// Noise of a detection, as it weighs in the map.
+    pub noise: RangeNoise,
 }
 
 impl Params {
     /// The parameters of a preset.
     #[must_use]
     pub fn preset(preset: Preset) -> Self {
-        Self { preset }
+        match preset {
+            Preset::Paper => Self::paper(),
+            Preset::Default => Self::mended(),
+        }
+    }
+
+    /// The paper's numbers; where it gives none, its code's (`paper_notes.md`).
+    fn paper() -> Self {
+        // 0.1 m at the camera to 1.0 m at the far corner of the crop box, 51 m away.
+        let noise = RangeNoise { near_m: 0.1, growth_m: 0.9, reference_range_m: 51.0, exponent: 1.0 };
+        Self {
+            preset: Preset::Paper,
+            observation: ObservationParams {
+                ahead_from_m: 3.0,
+                ahead_to_m: 50.0,
+                side_m: 10.0,
+                thin_m: 0.5,
+                least_points: 4,
+                least_length_m: 0.5,
+                flat_spread_m: 0.1,
+                flat_order: 0,
+                curved_spread_m: 1.0,
+                weighted_fit: false,
+                outlier_floor_m: 0.0,
+                sample_step_m: 0.5,
+                noise,
+            },
+            association: AssociationParams {
+                least_sigma_rad: 0.0,
+                least_sigma_m: 0.0,
+                least_bound_m: 1.0,
+                bound_noise_m: 0.5,
+                ..Self::mended().association
+            },
+            tracking: TrackingParams { iterations: 10, point_step_m: 1.0, ..Self::mended().tracking },
+            landmark: LandmarkParams {
+                chord_m: 3.0,
+                ends: EndRule::Open,
+                chord_sigma_m: 1.0,
+                bend_sigma_m: f64::INFINITY,
+                witnesses: f64::INFINITY,
+                huber_m: 0.5,
+                window_frames: 0,
+                sample_stride: 1,
+                least_observations: 4,
+                noise,
+            },
+        }
+    }
+
+    fn mended() -> Self {
+        let noise = RangeNoise { near_m: 0.08, growth_m: 0.5, reference_range_m: 50.0, exponent: 1.5 };
+        Self {
+            preset: Preset::Default,
+            observation: ObservationParams {
+                ahead_from_m: 3.0,
+                ahead_to_m: 62.0,
+                side_m: 12.0,
+                thin_m: 0.5,
+                least_points: 3,
+                least_length_m: 4.0,
+                flat_spread_m: 0.1,
+                flat_order: 1,
+                curved_spread_m: 1.0,
+                weighted_fit: true,
+                outlier_floor_m: 0.3,
+                sample_step_m: 0.5,
+                noise,
+            },
+            association: AssociationParams {
+                least_sigma_rad: 0.002,
+                least_sigma_m: 0.05,
+                least_bound_m: 1.0,
+                bound_noise_m: 0.5,
+                noise: RangeNoise { near_m: 0.15, growth_m: 0.5, reference_range_m: 50.0, exponent: 1.0 },
+                witnesses: 3.0,
+                unassigned_cost: 8.0,
+                missed_cost: 1.0,
+                gate_m: 1.5,
+                gate_height_m: 2.0,
+                least_overlap_m: 5.0,
+                full_overlap_m: 20.0,
+                end_slack_m: 1.0,
+                play_range_m: 20.0,
+                single_hypothesis_m: 1.2,
+                expected_from_m: 8.0,
+                expected_to_m: 40.0,
+                expected_side_m: 8.0,
+                category_confusion: 0.1,
+            },
+            tracking: TrackingParams {
+                iterations: 4,
+                point_step_m: 3.0,
+                huber_sigmas: 2.0,
+                line_offset_sigma_m: 0.1,
+                line_slope_sigma_rad: 0.004,
+                line_bend_sigma_m: 0.3,
+                frame_yaw_sigma_rad: 0.003,
+                frame_pitch_sigma_rad: 0.005,
+                point_sigma_m: 0.1,
+                weak_direction: 1e-3,
+                odometry_sigma_m: 0.02,
+                odometry_sigma_rad: 0.001,
+            },
+            landmark: LandmarkParams {
+                chord_m: 3.0,
+                ends: EndRule::Reflected,
+                chord_sigma_m: 1.0,
+                bend_sigma_m: 0.1,
+                witnesses: 1.0,
+                huber_m: 0.8,
+                window_frames: 3,
+                sample_stride: 3,
+                least_observations: 3,
+                noise,
+            },
+        }
     }
 }

@@ -72,15 +72,11 @@ pub struct BandedSum {
 }
 
 impl BandedSum {
-    /// First knot and number of rows.
+    /// First and last knot, or `None` while there is no term.
     #[must_use]
-    pub fn span(&self) -> (Knot, usize) {
-        (self.first, self.rows.len())
-    }
-
-    /// Forgets the terms, keeps the memory.
-    pub fn clear(&mut self) {
-        self.rows.clear();
+    #[allow(clippy::cast_possible_wrap)] // a count of control points
+    pub fn span(&self) -> Option<(Knot, Knot)> {
+        (!self.rows.is_empty()).then(|| (self.first, self.first + self.rows.len() as Knot - 1))
     }
 
     /// Adds a term, with positions relative to `anchor`.
@@ -280,15 +276,14 @@ impl BandedInformation {
         }
     }
 
-    /// Puts `base + sums` in place of the rows of `first .. first + count`.
-    #[allow(clippy::cast_possible_wrap)] // a count of control points
-    pub fn replace(&mut self, first: Knot, count: usize, base: &BandedSum, sums: &VecDeque<BandedSum>) {
-        for knot in first..first + count as Knot {
+    /// Puts the total of `sums`, added in their order, in place of the rows of `first ..= last`.
+    pub fn replace<'a>(&mut self, first: Knot, last: Knot, sums: impl Iterator<Item = &'a BandedSum> + Clone) {
+        for knot in first..=last {
             let Some(index) = self.index(knot) else { continue };
-            let mut row = base.row(knot).copied().unwrap_or_default();
-            for sum in sums {
-                if let Some(recent) = sum.row(knot) {
-                    row.add(recent);
+            let mut row = Row::default();
+            for sum in sums.clone() {
+                if let Some(part) = sum.row(knot) {
+                    row.add(part);
                 }
             }
             if self.rows[index] != row {

@@ -189,7 +189,9 @@ mod tests {
     use super::*;
 
     fn arc(count: usize) -> Vec<Point3<f64>> {
-        (0..count).map(|i| Point3::new((i as f64 * 0.3).sin() * 10.0, (i as f64 * 0.3).cos() * 10.0, 0.1 * i as f64)).collect()
+        (0..count)
+            .map(|i| Point3::new((i as f64 * 0.3).sin() * 10.0, (i as f64 * 0.3).cos() * 10.0, 0.1 * i as f64))
+            .collect()
     }
 
     #[test]

@@ -112,10 +112,12 @@ mod tests {
     use proptest::prelude::*;
 
     fn bend() -> Vec<Point3<f64>> {
-        (0..20).map(|i| {
-            let angle = f64::from(i) * 3.0 / 60.0;
-            Point3::new(60.0 * angle.sin(), 60.0 * (1.0 - angle.cos()), 0.05 * f64::from(i))
-        }).collect()
+        (0..20)
+            .map(|i| {
+                let angle = f64::from(i) * 3.0 / 60.0;
+                Point3::new(60.0 * angle.sin(), 60.0 * (1.0 - angle.cos()), 0.05 * f64::from(i))
+            })
+            .collect()
     }
 
     proptest! {

@@ -11,7 +11,12 @@ use crate::lane_map::MapLane;
 /// Points of a curve between two parameters, both included, about `step_m` apart for chords of `chord_m`.
 #[must_use]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a count of points, positive and small
-pub fn sample<P: ControlPolygon + ?Sized>(curve: &Curve<'_, P>, from: f64, to: f64, pieces_per_chord: usize) -> Vec<Point3<f64>> {
+pub fn sample<P: ControlPolygon + ?Sized>(
+    curve: &Curve<'_, P>,
+    from: f64,
+    to: f64,
+    pieces_per_chord: usize,
+) -> Vec<Point3<f64>> {
     let from = from.max(curve.first_parameter());
     let to = to.min(curve.last_parameter());
     if to < from {

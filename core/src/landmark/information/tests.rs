@@ -1,6 +1,6 @@
 //! Incremental equals batch (faer) and GTSAM's iSAM2, whatever grows where.
 
-use faer::{Mat, linalg::solvers::Solve, prelude::*};
+use faer::{Mat, linalg::solvers::Solve};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

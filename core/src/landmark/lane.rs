@@ -1,0 +1,456 @@
+//! A lane of the map and its life: born of one observation, grown and smoothed by those that follow.
+//!
+//! Paper: "Spline Optimization". Every sample of an associated observation adds a point-to-spline term
+//! `r_k = T p_k - p(u_k)`, weighted by its range and Huber's kernel; neighbouring control points are tied by chordal terms
+//! as initialised. `default` differs in three things (`paper_notes.md` 4, 7): the samples of one line in one frame share the
+//! information of a few witnesses, second differences are held small, and the last frames' foot points and weights are
+//! evaluated anew before they are folded into the information for good (fluid relinearisation in a window).
+
+use std::collections::VecDeque;
+
+use nalgebra::{Point3, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::{
+    category::CategoryBelief,
+    existence::Existence,
+    extent::{Extent, Sighting},
+    growth::{self, GrowthRule},
+    information::{BandedInformation, BandedSum, Knot, Term},
+};
+use crate::{
+    frame::TimestampNs,
+    geometry::Pose,
+    lane_map::{EndRule, LaneId},
+    observation::{LaneObservation, sigma_at},
+    params::LandmarkParams,
+    spline::{Curve, FootPoint, foot_point_coarse, foot_point_refined},
+};
+
+/// Holds a new lane together until it has data: information of its first control point, 1/m^2.
+const FAINT: f64 = 1e-6;
+
+/// A lane of the map.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Landmark {
+    /// Number within the drive.
+    pub id: LaneId,
+    /// What it is painted as.
+    pub category: CategoryBelief,
+    /// Whether it exists.
+    pub existence: Existence,
+    /// Where it begins and ends.
+    pub extent: Extent,
+    /// Frames that saw it.
+    pub observations: u32,
+    /// Time of the first frame that saw it.
+    pub first_seen: TimestampNs,
+    /// Time of the last frame that saw it.
+    pub last_seen: TimestampNs,
+    /// Another lane that may be the same, and how many frames spoke for it (negative: against).
+    pub rival: Option<(LaneId, i32)>,
+    information: BandedInformation,
+    /// Terms that will not be evaluated again.
+    folded: BandedSum,
+    /// Terms of the last frames.
+    recent: VecDeque<RecentFrame>,
+    /// Knots whose rows are out of date.
+    stale: Option<(Knot, Knot)>,
+}
+
+/// Samples of one frame that are still evaluated anew.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct RecentFrame {
+    samples: Vec<MapSample>,
+    sum: BandedSum,
+}
+
+/// An observed point in the map.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MapSample {
+    /// Position, map frame, metres.
+    pub point: Point3<f64>,
+    /// Information before the robust kernel, 1/m^2.
+    pub information: f64,
+}
+
+/// Brings an observation into the map: the samples that enter it, with their share of the line's information.
+#[must_use]
+pub fn map_samples(
+    observation: &LaneObservation,
+    map_from_vehicle: &Pose,
+    camera: &Point3<f64>,
+    params: &LandmarkParams,
+) -> Vec<MapSample> {
+    let count = observation.samples.len().div_ceil(params.sample_stride);
+    let share = (params.witnesses / count as f64).min(1.0);
+    let sample = |sample: &crate::observation::ObservedPoint| {
+        let range_m = (sample.point_vehicle.xy() - camera.xy()).norm();
+        MapSample {
+            point: map_from_vehicle * sample.point_vehicle,
+            information: share * sigma_at(&params.noise, range_m).powi(-2),
+        }
+    };
+    observation.samples.iter().step_by(params.sample_stride).map(sample).collect()
+}
+
+impl Landmark {
+    /// A lane begun by an observation; `None` where the line is too short for control points.
+    #[must_use]
+    pub fn begin(
+        id: LaneId,
+        observation: &LaneObservation,
+        map_from_vehicle: &Pose,
+        time: TimestampNs,
+        params: &LandmarkParams,
+    ) -> Option<Self> {
+        let points = growth::begin(observation, map_from_vehicle, &growth_rule(params));
+        let least = match params.ends {
+            EndRule::Open => 4,
+            EndRule::Reflected => 3,
+        };
+        if points.len() < least {
+            return None;
+        }
+        let mut lane = Self {
+            id,
+            category: CategoryBelief::default(),
+            existence: Existence::at_birth(),
+            extent: Extent::default(),
+            observations: 0,
+            first_seen: time,
+            last_seen: time,
+            rival: None,
+            information: BandedInformation::new(points[0]),
+            folded: BandedSum::default(),
+            recent: VecDeque::with_capacity(params.window_frames + 1),
+            stale: None,
+        };
+        for point in &points {
+            lane.append(*point, params);
+        }
+        lane.fold(Term { first: 0, weights: [1.0, 0.0, 0.0, 0.0], target: points[0].coords, information: FAINT });
+        Some(lane)
+    }
+
+    /// Control points in the direction of travel, map frame.
+    #[must_use]
+    pub fn positions(&self) -> &VecDeque<Point3<f64>> {
+        self.information.positions()
+    }
+
+    /// What is known of the control points.
+    #[must_use]
+    pub fn information(&self) -> &BandedInformation {
+        &self.information
+    }
+
+    /// Knots of the first and the last control point.
+    #[must_use]
+    pub fn knots(&self) -> (Knot, Knot) {
+        (self.information.head(), self.information.knot(self.information.len() - 1))
+    }
+
+    /// The curve; a landmark always has control points enough for one.
+    #[must_use]
+    pub fn curve(&self, ends: EndRule) -> Option<Curve<'_, VecDeque<Point3<f64>>>> {
+        Curve::new(self.positions(), ends)
+    }
+
+    /// Index of the control point nearest to `query` among some, both ends included.
+    #[must_use]
+    pub fn nearest_index(&self, query: &Point3<f64>, from: usize, to: usize) -> usize {
+        let squared = |index: usize| (self.positions()[index] - query).norm_squared();
+        (from..=to).min_by(|a, b| squared(*a).total_cmp(&squared(*b))).unwrap_or(from)
+    }
+
+    /// Index of a knot, held within the lane.
+    #[must_use]
+    pub fn index_of(&self, knot: Knot) -> usize {
+        let index = usize::try_from(knot - self.information.head()).unwrap_or(0);
+        index.min(self.information.len() - 1)
+    }
+
+    /// Adds a term that will not be evaluated again.
+    fn fold(&mut self, term: Term) {
+        let anchor = *self.information.anchor();
+        self.folded.add(&term, &anchor);
+        self.mark(term.first, term.first + 3);
+    }
+
+    /// Notes that the rows of some knots are out of date.
+    fn mark(&mut self, first: Knot, last: Knot) {
+        let (low, high) = self.stale.unwrap_or((first, last));
+        self.stale = Some((low.min(first), high.max(last)));
+    }
+
+    /// Adds a control point behind the last, tied to its neighbours.
+    fn append(&mut self, point: Point3<f64>, params: &LandmarkParams) {
+        let previous = self.positions().back().copied();
+        self.information.push_tail(point);
+        let (_, last) = self.knots();
+        if let Some(previous) = previous {
+            self.tie(last - 1, point - previous, params);
+        }
+        if self.information.len() >= 3 {
+            self.straighten(last - 2, params);
+        }
+    }
+
+    /// Adds a control point before the first, tied to its neighbours.
+    fn prepend(&mut self, point: Point3<f64>, params: &LandmarkParams) {
+        let next = self.positions()[0];
+        self.information.push_head(point);
+        let (first, _) = self.knots();
+        self.tie(first, next - point, params);
+        self.straighten(first, params);
+    }
+
+    /// The paper's constant constraint: neighbours stay as far apart as they were initialised.
+    fn tie(&mut self, first: Knot, delta: Vector3<f64>, params: &LandmarkParams) {
+        let information = params.chord_sigma_m.powi(-2);
+        self.fold(Term { first, weights: [-1.0, 1.0, 0.0, 0.0], target: delta, information });
+    }
+
+    /// Roads bend little within two chords (ours).
+    fn straighten(&mut self, first: Knot, params: &LandmarkParams) {
+        let information = params.bend_sigma_m.powi(-2);
+        if information > 0.0 {
+            self.fold(Term { first, weights: [1.0, -2.0, 1.0, 0.0], target: Vector3::zeros(), information });
+        }
+    }
+
+    /// Grows both ends by what an observation saw beyond them; whether the lane became longer.
+    pub fn grow(&mut self, observation: &LaneObservation, map_from_vehicle: &Pose, params: &LandmarkParams) -> bool {
+        let rule = growth_rule(params);
+        let count = self.information.len();
+        let (inner, end) = (self.positions()[count - 2], self.positions()[count - 1]);
+        let behind = growth::grow(observation, map_from_vehicle, &inner, &end, &rule);
+        let (inner, end) = (self.positions()[1], self.positions()[0]);
+        let before = growth::grow(observation, map_from_vehicle, &inner, &end, &rule);
+        for point in &behind {
+            self.append(*point, params);
+        }
+        for point in &before {
+            self.prepend(*point, params);
+        }
+        !behind.is_empty() || !before.is_empty()
+    }
+
+    /// Takes the samples of one frame into the information and solves.
+    ///
+    /// `near` are knots between which the samples lie.
+    pub fn smooth(&mut self, samples: Vec<MapSample>, near: (Knot, Knot), params: &LandmarkParams) {
+        let sum = self.linearise(&samples, near, params);
+        self.mark_sum(&sum);
+        self.recent.push_back(RecentFrame { samples, sum });
+        if self.recent.len() > params.window_frames {
+            self.fold_oldest(near, params);
+        }
+        self.solve();
+    }
+
+    /// Evaluates the oldest recent frame at the lane as it is now, for the last time.
+    fn fold_oldest(&mut self, near: (Knot, Knot), params: &LandmarkParams) {
+        let Some(oldest) = self.recent.pop_front() else { return };
+        let sum = if params.window_frames == 0 { oldest.sum } else {
+            self.mark_sum(&oldest.sum);
+            self.linearise(&oldest.samples, near, params)
+        };
+        self.mark_sum(&sum);
+        self.folded.absorb(&sum);
+    }
+
+    fn mark_sum(&mut self, sum: &BandedSum) {
+        if let Some((first, last)) = sum.span() {
+            self.mark(first, last);
+        }
+    }
+
+    /// Brings the stale rows, and with them the control points, up to date.
+    fn solve(&mut self) {
+        if let Some((first, last)) = self.stale.take() {
+            let sums = std::iter::once(&self.folded).chain(self.recent.iter().map(|frame| &frame.sum));
+            self.information.replace(first, last, sums);
+        }
+        self.information.solve();
+    }
+
+    /// The terms of some samples at the lane as it is now. Samples beyond its ends say nothing.
+    fn linearise(&self, samples: &[MapSample], near: (Knot, Knot), params: &LandmarkParams) -> BandedSum {
+        let mut sum = BandedSum::default();
+        let Some(curve) = self.curve(params.ends) else { return sum };
+        let mut walk = FootWalk::new(self, &curve, near, params);
+        for sample in samples {
+            let Some(foot) = walk.foot_point(&sample.point) else { continue };
+            let support = curve.support(foot.parameter);
+            let robust = if foot.distance_m <= params.huber_m { 1.0 } else { params.huber_m / foot.distance_m };
+            let term = Term {
+                first: self.information.knot(support.first),
+                weights: support.weights,
+                target: sample.point.coords,
+                information: sample.information * robust,
+            };
+            sum.add(&term, self.information.anchor());
+        }
+        sum
+    }
+
+    /// Counts this frame's votes on where the line begins and ends.
+    pub fn vote_extent(
+        &mut self,
+        observation: &LaneObservation,
+        map_from_vehicle: &Pose,
+        near: (Knot, Knot),
+        visibility: impl Fn(&Point3<f64>) -> f64,
+        params: &LandmarkParams,
+    ) {
+        let Some(curve) = self.curve(params.ends) else { return };
+        let head = self.information.head() as f64;
+        let mut walk = FootWalk::new(self, &curve, near, params);
+        let mut place = |x: f64| head + walk.nearest_parameter(&(map_from_vehicle * observation.point_at(x)));
+        let (reported_from, certain_from) = (place(observation.reported.0), place(observation.certain.0));
+        let (certain_to, reported_to) = (place(observation.certain.1), place(observation.reported.1));
+        let along = |a: f64, b: f64| if a <= b { (a, b) } else { (b, a) };
+        let sighting = Sighting {
+            reported: along(reported_from, reported_to),
+            certain: along(certain_from, certain_to),
+        };
+        let from = (near.0 as f64).max(head);
+        let to = head + curve.last_parameter();
+        let mut extent = std::mem::take(&mut self.extent);
+        let curve = self.curve(params.ends);
+        if let Some(curve) = curve {
+            extent.vote(&sighting, from, to, |parameter| visibility(&curve.point(parameter - head)));
+        }
+        self.extent = extent;
+    }
+
+    /// First and last parameter of the line as drawn, counted from the first control point.
+    #[must_use]
+    pub fn drawn(&self, params: &LandmarkParams) -> Option<(f64, f64)> {
+        let curve = self.curve(params.ends)?;
+        let (first, last) = (curve.first_parameter(), curve.last_parameter());
+        if params.ends == EndRule::Open {
+            return Some((first, last));
+        }
+        let head = self.information.head() as f64;
+        let (from, to) = self.extent.drawn()?;
+        let (from, to) = ((from - head).max(first), (to - head).min(last));
+        (to > from).then_some((from, to))
+    }
+
+    /// Adds what another lane knows, which turned out to be this one: its control points as observations of this curve.
+    ///
+    /// Points of the other beyond this lane's ends are appended first, so nothing that was seen is lost.
+    pub fn absorb(&mut self, other: &Self, params: &LandmarkParams) {
+        let variances = other.information.variances(0);
+        let tail_of_mine = *self.positions().back().unwrap_or(self.information.anchor());
+        let nearest = other.nearest_index(&tail_of_mine, 0, other.positions().len() - 1);
+        let reaches_on = other.positions().iter().skip(nearest + 1);
+        let beyond: Vec<Point3<f64>> = reaches_on.filter(|point| self.is_beyond_tail(point)).copied().collect();
+        for point in beyond {
+            self.append(point, params);
+        }
+        let near = self.knots();
+        let samples: Vec<MapSample> = other
+            .positions()
+            .iter()
+            .zip(&variances)
+            .map(|(point, variance)| MapSample { point: *point, information: 1.0 / variance.max(1e-6) })
+            .collect();
+        let sum = self.linearise(&samples, near, params);
+        self.mark_sum(&sum);
+        self.folded.absorb(&sum);
+        self.absorb_votes(other, params);
+        self.solve();
+    }
+
+    fn is_beyond_tail(&self, point: &Point3<f64>) -> bool {
+        let count = self.information.len();
+        let (inner, end) = (self.positions()[count - 2], self.positions()[count - 1]);
+        (point - end).dot(&(end - inner)) > 0.5 * (end - inner).norm_squared()
+    }
+
+    fn absorb_votes(&mut self, other: &Self, params: &LandmarkParams) {
+        self.category.absorb(&other.category);
+        self.existence.absorb(other.existence);
+        self.observations += other.observations;
+        self.first_seen = self.first_seen.min(other.first_seen);
+        self.last_seen = self.last_seen.max(other.last_seen);
+        let mut extent = std::mem::take(&mut self.extent);
+        if let (Some(mine), Some(theirs)) = (self.curve(params.ends), other.curve(params.ends)) {
+            let near = self.knots();
+            let (head, their_head) = (near.0 as f64, other.information.head() as f64);
+            let to_mine = |parameter: f64| {
+                let mut walk = FootWalk::new(self, &mine, near, params);
+                head + walk.nearest_parameter(&theirs.point(parameter - their_head))
+            };
+            extent.absorb(&other.extent, to_mine);
+        }
+        self.extent = extent;
+    }
+}
+
+/// Foot points of samples in the order along a lane, each search starting where the last one ended.
+pub struct FootWalk<'a> {
+    lane: &'a Landmark,
+    curve: &'a Curve<'a, VecDeque<Point3<f64>>>,
+    near: (usize, usize),
+    ends: EndRule,
+    chord_m: f64,
+    last: Option<f64>,
+}
+
+impl<'a> FootWalk<'a> {
+    /// A walk along a lane between two knots.
+    #[must_use]
+    pub fn new(
+        lane: &'a Landmark,
+        curve: &'a Curve<'a, VecDeque<Point3<f64>>>,
+        near: (Knot, Knot),
+        params: &LandmarkParams,
+    ) -> Self {
+        let near = (lane.index_of(near.0), lane.index_of(near.1));
+        Self { lane, curve, near, ends: params.ends, chord_m: params.chord_m, last: None }
+    }
+
+    /// Foot point of the next sample; `None` beyond the lane's ends.
+    pub fn foot_point(&mut self, query: &Point3<f64>) -> Option<FootPoint> {
+        match self.ends {
+            EndRule::Open => {
+                let nearest = self.lane.nearest_index(query, self.near.0, self.near.1);
+                foot_point_coarse(self.curve, query, nearest, self.chord_m)
+            }
+            EndRule::Reflected => {
+                let start = self.start(query);
+                let foot = foot_point_refined(self.curve, query, start);
+                self.last = foot.map(|foot| foot.parameter).or(self.last);
+                foot
+            }
+        }
+    }
+
+    /// Parameter of the foot point, or of the end beyond which the query lies.
+    pub fn nearest_parameter(&mut self, query: &Point3<f64>) -> f64 {
+        let start = self.start(query);
+        let (first, last) = (self.curve.first_parameter(), self.curve.last_parameter());
+        foot_point_refined(self.curve, query, start).map_or_else(
+            || {
+                let to_first = (self.curve.point(first) - query).norm_squared();
+                let to_last = (self.curve.point(last) - query).norm_squared();
+                if to_first < to_last { first } else { last }
+            },
+            |foot| foot.parameter,
+        )
+    }
+
+    fn start(&self, query: &Point3<f64>) -> f64 {
+        self.last.unwrap_or_else(|| self.lane.nearest_index(query, self.near.0, self.near.1) as f64)
+    }
+}
+
+fn growth_rule(params: &LandmarkParams) -> GrowthRule {
+    let ours = params.ends == EndRule::Reflected;
+    GrowthRule { chord_m: params.chord_m, extrapolate: !ours, join: ours }
+}

@@ -1,0 +1,167 @@
+//! The part of the map that a frame can see: nearby lanes, as the stages of a step want them.
+
+use std::{cell::RefCell, collections::BTreeMap};
+
+use nalgebra::{Point3, Vector3, Vector6};
+
+use crate::{
+    association::LaneShape,
+    geometry::{Pose, pose::perturb},
+    landmark::{
+        Landmark,
+        index::{LaneIndex, NearbyRun, STALE_M},
+        information::Knot,
+        lane::FootWalk,
+    },
+    lane_map::LaneId,
+    observation::LaneObservation,
+    params::{ObservationParams, Params},
+    sensor::Sensor,
+    spline::sampling::sample,
+    tracking::{Correspondence, MatchedLane},
+};
+
+/// Lanes within this radius of the middle of the view are looked at, metres.
+const RADIUS_M: f64 = 55.0;
+/// The middle of the view, metres ahead of the vehicle.
+const MIDDLE_M: f64 = 28.0;
+/// Samples of a lane per chord, for association.
+const PIECES_PER_CHORD: usize = 2;
+
+/// Nearby lanes in the order of their ids.
+pub(super) struct Scene {
+    /// Where each lane is near.
+    pub runs: Vec<NearbyRun>,
+    /// The same lanes as polylines in the vehicle frame at the predicted pose.
+    pub shapes: Vec<LaneShape>,
+}
+
+impl Scene {
+    /// The lanes around a predicted pose.
+    pub fn around(map_from_vehicle: &Pose, lanes: &BTreeMap<LaneId, Landmark>, index: &LaneIndex, params: &Params) -> Self {
+        let middle = map_from_vehicle * Point3::new(MIDDLE_M, 0.0, 0.0);
+        let (mut runs, mut shapes) = (Vec::new(), Vec::new());
+        for run in index.within(&middle, RADIUS_M + STALE_M) {
+            let Some(lane) = lanes.get(&run.lane) else { continue };
+            if let Some(shape) = shape_of(lane, &run, map_from_vehicle, params) {
+                runs.push(run);
+                shapes.push(shape);
+            }
+        }
+        Self { runs, shapes }
+    }
+
+    /// Matched observations with the foot points of their samples, for the pose update.
+    pub fn matched_lanes<'a>(
+        &self,
+        observations: &'a [LaneObservation],
+        lane_of: &[Option<usize>],
+        lanes: &'a BTreeMap<LaneId, Landmark>,
+        params: &'a Params,
+    ) -> Vec<MatchedLane<'a>> {
+        let mut matched = Vec::new();
+        for (observation, shape) in observations.iter().zip(lane_of) {
+            let Some(lane) = shape.and_then(|shape| lanes.get(&self.runs[shape].lane)) else { continue };
+            // A lane seen once agrees with the frame that began it, whatever the pose.
+            if lane.observations < 2 {
+                continue;
+            }
+            let step = (params.tracking.point_step_m / params.observation.sample_step_m).round().max(1.0);
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a small positive stride
+            let points: Vec<Point3<f64>> =
+                observation.samples.iter().step_by(step as usize).map(|sample| sample.point_vehicle).collect();
+            let run = shape.map(|shape| self.runs[shape]);
+            let near = run.map_or_else(|| lane.knots(), |run| (run.first, run.last));
+            let hints = RefCell::new(Vec::new());
+            let query = points.clone();
+            let foot_points = Box::new(move |pose: &Pose| correspondences(lane, near, &query, pose, params, &hints));
+            matched.push(MatchedLane { points_vehicle: points, foot_points });
+        }
+        matched
+    }
+}
+
+fn correspondences(
+    lane: &Landmark,
+    near: (Knot, Knot),
+    points: &[Point3<f64>],
+    pose: &Pose,
+    params: &Params,
+    _hints: &RefCell<Vec<f64>>,
+) -> Vec<Option<Correspondence>> {
+    let Some(curve) = lane.curve(params.landmark.ends) else { return vec![None; points.len()] };
+    let mut walk = FootWalk::new(lane, &curve, near, &params.landmark);
+    points
+        .iter()
+        .map(|point| {
+            let foot = walk.foot_point(&(pose * point))?;
+            let tangent_map = curve.derivative(foot.parameter).try_normalize(1e-9)?;
+            Some(Correspondence { foot_map: curve.point(foot.parameter), tangent_map })
+        })
+        .collect()
+}
+
+/// A nearby lane as a polyline in the vehicle frame.
+fn shape_of(lane: &Landmark, run: &NearbyRun, map_from_vehicle: &Pose, params: &Params) -> Option<LaneShape> {
+    let curve = lane.curve(params.landmark.ends)?;
+    let (from, to) = (lane.index_of(run.first) as f64, lane.index_of(run.last) as f64);
+    let points = sample(&curve, from, to, PIECES_PER_CHORD);
+    if points.len() < 2 {
+        return None;
+    }
+    Some(LaneShape {
+        category: lane.category.best(),
+        category_log_likelihood: lane.category.log_likelihood(params.association.category_confusion),
+        points: points.iter().map(|point| map_from_vehicle.inverse_transform_point(point)).collect(),
+    })
+}
+
+/// The pose with an estimated error `(x, y, yaw)`, vehicle frame, taken away.
+pub(super) fn displaced(map_from_vehicle: &Pose, error: &Vector3<f64>) -> Pose {
+    perturb(map_from_vehicle, &Vector6::new(-error.x, -error.y, 0.0, 0.0, 0.0, -error.z))
+}
+
+/// Knots of a lane between which an observation lies, by the ends of the observation.
+pub(super) fn near_knots(lane: &Landmark, map_from_vehicle: &Pose, observation: &LaneObservation) -> (Knot, Knot) {
+    let last = lane.positions().len() - 1;
+    let index_near = |x: f64| lane.nearest_index(&(map_from_vehicle * observation.point_at(x)), 0, last);
+    let (a, b) = (index_near(observation.reported.0), index_near(observation.reported.1));
+    let (low, high) = (a.min(b).saturating_sub(4), (a.max(b) + 4).min(last));
+    (lane.information().knot(low), lane.information().knot(high))
+}
+
+/// How surely the detector would report a line that runs through a place (vehicle frame), in `[0, 1]`.
+pub(super) fn visibility(point_vehicle: &Point3<f64>, sensor: &Sensor, params: &ObservationParams) -> f64 {
+    /// Up to here a detector reports whatever it reports at all, metres.
+    const SURE_M: f64 = 30.0;
+    /// From here on it reports nothing for sure, metres.
+    const BLIND_M: f64 = 58.0;
+    let offset = point_vehicle - Point3::from(sensor.ground_offset());
+    let outside = offset.x < params.ahead_from_m || offset.y.abs() > params.side_m || !sensor.sees(point_vehicle);
+    if outside { 0.0 } else { ((BLIND_M - offset.xy().norm()) / (BLIND_M - SURE_M)).clamp(0.0, 1.0) }
+}
+
+/// Chance that a frame at this pose reports a lane that exists.
+pub(super) fn detection_probability(
+    lane: &Landmark,
+    run: &NearbyRun,
+    map_from_vehicle: &Pose,
+    sensor: &Sensor,
+    params: &Params,
+) -> f64 {
+    let Some((from, to)) = lane.drawn(&params.landmark) else { return 0.5 };
+    let (mut length, mut side) = (0.0, 0.0);
+    for index in lane.index_of(run.first)..=lane.index_of(run.last) {
+        if (index as f64) < from || (index as f64) > to {
+            continue;
+        }
+        let point = map_from_vehicle.inverse_transform_point(&lane.positions()[index]);
+        let visible = visibility(&point, sensor, &params.observation);
+        length += visible;
+        side += visible * point.y.abs();
+    }
+    // Three control points well in view are enough to be reported; lines far to the side are often missed.
+    let share = (length / 4.0).min(1.0);
+    let side_m = if length > 0.0 { side / length } else { 0.0 };
+    share * (0.85 - 0.04 * (side_m - 2.0).clamp(0.0, 10.0))
+}

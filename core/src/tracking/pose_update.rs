@@ -1,0 +1,363 @@
+//! Pose update: the pose at which the frame's lanes lie on the lanes of the map.
+//!
+//! Paper: "Pose Update": minimise `sum rho(|(I - d d^T)(T p_k - p(u_k))|^2) + |log(T_odo^-1 T)|^2_P` over SE(3), `d` the unit
+//! tangent. Levenberg-Marquardt, foot points found anew at every iteration, Huber's kernel, the odometry term weighted
+//! by its covariance, and the covariance of the result from the final Hessian (`paper_notes.md` 4).
+//!
+//! Where we differ: a hundred points along one line are not a hundred measurements. A line's error in one frame is
+//! `B a + white`, `B = [1, r, (r / r_0)^2]` in the range `r`, `a ~ N(0, S)`, sideways and in height. The `a` are eliminated in closed
+//! form (Woodbury): `H = J^T D J - J^T D B (S^-1 + B^T D B)^-1 B^T D J`. Yaw and pitch errors that all lines of a frame
+//! share are eliminated likewise. What the lanes hardly constrain (a straight road says nothing along itself) is left to
+//! odometry: directions whose share of the lanes' information, in units of the prior, is below a threshold are dropped.
+
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+
+use super::PoseEstimate;
+use crate::{
+    geometry::{
+        Pose,
+        pose::{log, perturb},
+    },
+    params::TrackingParams,
+};
+
+/// Where an observed point lies on the map, at some pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Correspondence {
+    /// Foot point, map frame, metres.
+    pub foot_map: Point3<f64>,
+    /// Unit tangent of the lane there, map frame.
+    pub tangent_map: Vector3<f64>,
+}
+
+/// A detection that was taken for a lane: its points, and how to find their foot points.
+pub struct MatchedLane<'a> {
+    /// Points of the observation, vehicle frame, metres.
+    pub points_vehicle: Vec<Point3<f64>>,
+    /// Foot points of the points at a pose, in their order; `None` for a point beyond the lane's ends.
+    pub foot_points: Box<dyn Fn(&Pose) -> Vec<Option<Correspondence>> + 'a>,
+}
+
+/// Range at which the bend of a line's error is quoted, metres.
+const BEND_RANGE_M: f64 = 50.0;
+
+/// Corrects a predicted pose by the lanes matched in one frame, starting the search at `start`.
+#[must_use]
+pub fn update_pose(
+    predicted: &PoseEstimate,
+    start: &Pose,
+    lanes: &[MatchedLane<'_>],
+    params: &TrackingParams,
+) -> PoseEstimate {
+    let Some(prior) = Prior::new(predicted) else { return *predicted };
+    let mut pose = *start;
+    let mut damping = 0.0;
+    let mut current = Normal::of(lanes, &pose, &prior, params);
+    for _ in 0..params.iterations {
+        let Some(step) = current.step(damping) else { break };
+        let moved = perturb(&pose, &step);
+        let next = Normal::of(lanes, &moved, &prior, params);
+        if next.cost > current.cost * (1.0 + 1e-9) {
+            damping = (damping * 10.0f64).max(1e-3);
+            continue;
+        }
+        pose = moved;
+        current = next;
+        damping *= 0.1;
+        if step.fixed_rows::<3>(0).norm() < 1e-3 && step.fixed_rows::<3>(3).norm() < 1e-5 {
+            break;
+        }
+    }
+    let covariance = current.hessian.cholesky().map_or(predicted.covariance, |factor| factor.inverse());
+    PoseEstimate { map_from_vehicle: pose, covariance: (covariance + covariance.transpose()) * 0.5 }
+}
+
+/// The odometry term.
+struct Prior {
+    predicted_from_map: Pose,
+    /// `P = L L^T`.
+    root: Matrix6<f64>,
+    information: Matrix6<f64>,
+}
+
+impl Prior {
+    fn new(predicted: &PoseEstimate) -> Option<Self> {
+        // A variance of nothing at all (a first frame, odometry that claims to be exact) still needs an inverse.
+        let floored = predicted.covariance + Matrix6::identity() * 1e-10;
+        let factor = floored.cholesky()?;
+        Some(Self {
+            predicted_from_map: predicted.map_from_vehicle.inverse(),
+            root: factor.l(),
+            information: factor.inverse(),
+        })
+    }
+}
+
+/// Normal equations of one linearisation.
+struct Normal {
+    hessian: Matrix6<f64>,
+    gradient: Vector6<f64>,
+    cost: f64,
+}
+
+impl Normal {
+    fn of(lanes: &[MatchedLane<'_>], pose: &Pose, prior: &Prior, params: &TrackingParams) -> Self {
+        let (mut hessian, mut gradient, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
+        for lane in lanes {
+            let feet = (lane.foot_points)(pose);
+            for axis in [Axis::Lateral, Axis::Vertical] {
+                let sums = LineSums::of(axis, &lane.points_vehicle, &feet, pose, params);
+                let (h, g, c) = sums.without_line_error(axis, params);
+                hessian += h;
+                gradient += g;
+                cost += c;
+            }
+        }
+        let (hessian, gradient, cost) = without_shared_rotation(&hessian, &gradient, cost, params);
+        let (hessian, gradient) = without_weak_directions(&hessian, &gradient, prior, params);
+        let deviation = log(&(prior.predicted_from_map * pose));
+        let pull = prior.information * deviation;
+        Self { hessian: hessian + prior.information, gradient: gradient + pull, cost: cost + deviation.dot(&pull) }
+    }
+
+    fn step(&self, damping: f64) -> Option<Vector6<f64>> {
+        let damped = self.hessian + Matrix6::from_diagonal(&(self.hessian.diagonal() * damping));
+        damped.cholesky().map(|factor| -factor.solve(&self.gradient))
+    }
+}
+
+/// The two directions across a line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Axis {
+    Lateral,
+    Vertical,
+}
+
+/// Weighted sums over the points of one line: `J^T D J`, `J^T D B`, `B^T D B`, and the residuals against both.
+struct LineSums {
+    jj: Matrix6<f64>,
+    jb: Matrix6x3<f64>,
+    bb: Matrix3<f64>,
+    je: Vector6<f64>,
+    be: Vector3<f64>,
+    ee: f64,
+}
+
+impl LineSums {
+    fn of(
+        axis: Axis,
+        points: &[Point3<f64>],
+        feet: &[Option<Correspondence>],
+        pose: &Pose,
+        params: &TrackingParams,
+    ) -> Self {
+        let mut sums = Self {
+            jj: Matrix6::zeros(),
+            jb: Matrix6x3::zeros(),
+            bb: Matrix3::zeros(),
+            je: Vector6::zeros(),
+            be: Vector3::zeros(),
+            ee: 0.0,
+        };
+        let variance = params.point_sigma_m * params.point_sigma_m;
+        for (point, foot) in points.iter().zip(feet) {
+            let Some(foot) = foot else { continue };
+            let direction = across(axis, &foot.tangent_map);
+            let residual = direction.dot(&(pose * point - foot.foot_map));
+            let jacobian = residual_jacobian(pose, point, &direction);
+            let range = point.x;
+            let line = Vector3::new(1.0, range, (range / BEND_RANGE_M).powi(2));
+            // The kernel judges a residual by all that a sound line may be off there.
+            let expected = variance + line_variance(range, params);
+            let weight = huber_weight(residual / expected.sqrt(), params.huber_sigmas) / variance;
+            sums.jj += jacobian * jacobian.transpose() * weight;
+            sums.jb += jacobian * line.transpose() * weight;
+            sums.bb += line * line.transpose() * weight;
+            sums.je += jacobian * (residual * weight);
+            sums.be += line * (residual * weight);
+            sums.ee += residual * residual * weight;
+        }
+        sums
+    }
+
+    /// Hessian, gradient and cost with the line's own error polynomial eliminated.
+    fn without_line_error(&self, axis: Axis, params: &TrackingParams) -> (Matrix6<f64>, Vector6<f64>, f64) {
+        let _ = axis;
+        let prior = line_sigmas(params).map(|sigma| 1.0 / (sigma * sigma).max(1e-12));
+        let Some(factor) = (self.bb + Matrix3::from_diagonal(&prior)).cholesky() else {
+            return (self.jj, self.je, self.ee);
+        };
+        let solved_b = factor.solve(&self.be);
+        let hessian = self.jj - self.jb * factor.solve(&self.jb.transpose());
+        (hessian, self.je - self.jb * solved_b, self.ee - self.be.dot(&solved_b))
+    }
+}
+
+fn line_sigmas(params: &TrackingParams) -> Vector3<f64> {
+    Vector3::new(params.line_offset_sigma_m, params.line_slope_sigma_rad, params.line_bend_sigma_m)
+}
+
+fn line_variance(range_m: f64, params: &TrackingParams) -> f64 {
+    let sigmas = line_sigmas(params);
+    let slope = sigmas.y * range_m;
+    let bend = sigmas.z * (range_m / BEND_RANGE_M).powi(2);
+    sigmas.x * sigmas.x + slope * slope + bend * bend
+}
+
+/// Unit vector across a line: to its left in plan, or upwards and square to both.
+fn across(axis: Axis, tangent: &Vector3<f64>) -> Vector3<f64> {
+    let left = Vector3::z().cross(tangent).try_normalize(1e-9).unwrap_or_else(Vector3::y);
+    match axis {
+        Axis::Lateral => left,
+        Axis::Vertical => tangent.cross(&left),
+    }
+}
+
+/// Derivative of `direction . (T exp(xi) p)` by `xi`.
+fn residual_jacobian(pose: &Pose, point: &Point3<f64>, direction: &Vector3<f64>) -> Vector6<f64> {
+    let in_vehicle = pose.rotation.inverse() * direction;
+    let turning = point.coords.cross(&in_vehicle);
+    Vector6::new(in_vehicle.x, in_vehicle.y, in_vehicle.z, turning.x, turning.y, turning.z)
+}
+
+fn huber_weight(sigmas: f64, threshold: f64) -> f64 {
+    if sigmas.abs() <= threshold { 1.0 } else { threshold / sigmas.abs() }
+}
+
+/// Takes out what pitch and yaw errors of the whole frame, which look just like the vehicle's, may have done.
+fn without_shared_rotation(
+    hessian: &Matrix6<f64>,
+    gradient: &Vector6<f64>,
+    cost: f64,
+    params: &TrackingParams,
+) -> (Matrix6<f64>, Vector6<f64>, f64) {
+    let (mut hessian, mut gradient, mut cost) = (*hessian, *gradient, cost);
+    for (index, sigma) in [(4, params.frame_pitch_sigma_rad), (5, params.frame_yaw_sigma_rad)] {
+        let column = hessian.column(index).into_owned();
+        let pull = gradient[index];
+        let total = hessian[(index, index)] + 1.0 / (sigma * sigma).max(1e-12);
+        hessian -= column * column.transpose() / total;
+        gradient -= column * (pull / total);
+        cost -= pull * pull / total;
+    }
+    (hessian, gradient, cost)
+}
+
+/// Drops the directions in which the lanes say next to nothing, measured in units of the prior's uncertainty.
+fn without_weak_directions(
+    hessian: &Matrix6<f64>,
+    gradient: &Vector6<f64>,
+    prior: &Prior,
+    params: &TrackingParams,
+) -> (Matrix6<f64>, Vector6<f64>) {
+    let whitened = prior.root.transpose() * hessian * prior.root;
+    let eigen = whitened.symmetric_eigen();
+    let threshold = params.weak_direction * eigen.eigenvalues.max();
+    let Some(unwhiten) = prior.root.transpose().try_inverse() else { return (*hessian, *gradient) };
+    let pull = prior.root.transpose() * gradient;
+    let (mut kept, mut kept_pull) = (Matrix6::zeros(), Vector6::zeros());
+    for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+        if *value > threshold {
+            kept += vector * vector.transpose() * *value;
+            kept_pull += vector * vector.dot(&pull);
+        }
+    }
+    (unwhiten * kept * unwhiten.transpose(), unwhiten * kept_pull)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        geometry::pose::{covariance_from_sigmas, exp},
+        params::{Params, Preset},
+    };
+    use proptest::prelude::*;
+
+    fn params() -> TrackingParams {
+        Params::preset(Preset::Default).tracking
+    }
+
+    /// Three straight lines along x, seen from a vehicle whose true pose is `truth`.
+    fn scene(truth: &Pose) -> Vec<MatchedLane<'static>> {
+        [-3.5, 0.0, 3.5].iter().map(|y| {
+            let points_vehicle: Vec<Point3<f64>> =
+                (2..16).map(|k| truth.inverse_transform_point(&Point3::new(3.0 * f64::from(k), *y, 0.0))).collect();
+            let points = points_vehicle.clone();
+            let y = *y;
+            MatchedLane {
+                points_vehicle,
+                foot_points: Box::new(move |pose| {
+                    points.iter().map(|p| {
+                        let placed = pose * p;
+                        Some(Correspondence { foot_map: Point3::new(placed.x, y, 0.0), tangent_map: Vector3::x() })
+                    }).collect()
+                }),
+            }
+        }).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn lateral_yaw_and_height_errors_are_found_and_the_way_along_the_road_is_left_to_odometry(
+            y in -0.6..0.6f64, z in -0.2..0.2f64, yaw in -0.02..0.02f64, x in -0.5..0.5f64,
+        ) {
+            let truth = exp(&Vector6::new(x, y, z, 0.0, 0.0, yaw));
+            let covariance = covariance_from_sigmas([0.5, 0.5, 0.3], [1e-3, 1e-3, 0.02]);
+            let predicted = PoseEstimate { map_from_vehicle: Pose::identity(), covariance };
+            // Errors shared by the frame cannot be told from the vehicle's own: leave them out to see the geometry alone.
+            let exact = TrackingParams { frame_yaw_sigma_rad: 0.0, frame_pitch_sigma_rad: 0.0, iterations: 20, ..params() };
+            let found = update_pose(&predicted, &predicted.map_from_vehicle, &scene(&truth), &exact);
+            let error = log(&(truth.inverse() * found.map_from_vehicle));
+            prop_assert!(error[1].abs() < 0.06 && error[2].abs() < 0.06 && error[5].abs() < 2e-3, "{error}");
+            prop_assert!((found.map_from_vehicle.translation.x).abs() < 0.03);
+            prop_assert!(found.covariance[(0, 0)] > 0.2 && found.covariance[(1, 1)] < 0.02);
+        }
+
+        #[test]
+        fn the_jacobian_agrees_with_finite_differences(v in prop::array::uniform6(-0.5..0.5f64), p in prop::array::uniform3(-20.0..20.0f64)) {
+            let pose = exp(&Vector6::from_row_slice(&v));
+            let point = Point3::from(Vector3::from(p));
+            let direction = Vector3::new(0.6, -0.64, 0.48);
+            let jacobian = residual_jacobian(&pose, &point, &direction);
+            let step = 1e-6;
+            for axis in 0..6 {
+                let mut xi = Vector6::zeros();
+                xi[axis] = step;
+                let ahead = direction.dot(&(perturb(&pose, &xi) * point).coords);
+                let back = direction.dot(&(perturb(&pose, &-xi) * point).coords);
+                prop_assert!(((ahead - back) / (2.0 * step) - jacobian[axis]).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn eliminating_a_line_error_equals_inverting_the_full_covariance() {
+        let params = params();
+        let pose = Pose::identity();
+        let points: Vec<Point3<f64>> = (1..9).map(|k| Point3::new(5.0 * f64::from(k), 1.0, 0.0)).collect();
+        let feet: Vec<Option<Correspondence>> = points.iter()
+            .map(|p| Some(Correspondence { foot_map: Point3::new(p.x, 0.9, 0.0), tangent_map: Vector3::x() })).collect();
+        let (hessian, gradient, _) =
+            LineSums::of(Axis::Lateral, &points, &feet, &pose, &params).without_line_error(Axis::Lateral, &params);
+        let n = points.len();
+        let jacobian = nalgebra::DMatrix::from_fn(n, 6, |k, c| residual_jacobian(&pose, &points[k], &Vector3::y())[c]);
+        let residual = nalgebra::DVector::from_element(n, 0.1);
+        let sigma = line_sigmas(&params);
+        let covariance = nalgebra::DMatrix::from_fn(n, n, |a, b| {
+            let (ra, rb) = (points[a].x, points[b].x);
+            let bend = sigma.z * sigma.z * (ra * rb / 2500.0).powi(2);
+            let white = if a == b { params.point_sigma_m.powi(2) } else { 0.0 };
+            sigma.x * sigma.x + sigma.y * sigma.y * ra * rb + bend + white
+        });
+        let information = covariance.try_inverse().unwrap();
+        let expected = jacobian.transpose() * &information * &jacobian;
+        let expected_gradient = jacobian.transpose() * &information * residual;
+        for a in 0..6 {
+            assert!((gradient[a] - expected_gradient[a]).abs() < 1e-6 * (1.0 + expected_gradient[a].abs()));
+            for b in 0..6 {
+                assert!((hessian[(a, b)] - expected[(a, b)]).abs() < 1e-6 * (1.0 + expected.amax()));
+            }
+        }
+    }
+}

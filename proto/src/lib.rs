@@ -1,6 +1,9 @@
-//! Generated types of the lanemap wire protocol.
+//! Generated types of the lanemap wire protocol, and their conversion from and to the types of `lanemap-core`.
 //!
 //! The `.proto` files under `lanemap/v1` are the reference: unit, frame and range of every field stand in its comment.
+
+pub mod decode;
+pub mod encode;
 
 /// Package `lanemap.v1`.
 pub mod v1 {

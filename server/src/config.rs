@@ -1,0 +1,229 @@
+//! Settings of the service: flags over environment over file over defaults.
+//!
+//! A YAML file holds settings by the names of [`ServerConfig`]'s fields; the environment holds them as `LANEMAP_` and the
+//! name in capitals, e.g. `LANEMAP_DATA_DIR`. A name that is not a setting is refused in either.
+
+use std::{net::SocketAddr, path::Path, path::PathBuf, time::Duration};
+
+use lanemap_core::FrameLimits;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+mod overrides;
+
+pub use overrides::ConfigOverrides;
+
+/// Every setting of the service.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ServerConfig {
+    /// Address and port for gRPC and HTTP, e.g. `0.0.0.0:8080`; port 0 takes any free one.
+    pub listen: SocketAddr,
+    /// Folder of the embedded store; created where it does not exist.
+    pub data_dir: PathBuf,
+    /// Largest gRPC message, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
+    pub max_message_bytes: usize,
+    /// Most detections in a frame, at least 1.
+    pub max_detections: usize,
+    /// Most points in one detection, at least 2.
+    pub max_points_per_detection: usize,
+    /// Farthest point from the vehicle, metres, on each axis.
+    pub max_point_range_m: f64,
+    /// Farthest odometry position from the origin of its frame, metres, on each axis.
+    pub max_odometry_range_m: f64,
+    /// Most drives that the store holds.
+    pub max_sessions: usize,
+    /// Most streams of vehicles at a time.
+    pub max_live_sessions: usize,
+    /// Most connections at a time; more wait to be accepted.
+    pub max_connections: usize,
+    /// Frames of one session between the network and the journal, 1 to 4096; a faster vehicle waits.
+    pub max_frames_in_flight: usize,
+    /// Most frames of all sessions made durable together, at least 1.
+    pub max_frames_per_commit: usize,
+    /// Frames of a session after which its mapper's state is saved and its journal trimmed, at least 1.
+    pub snapshot_every_frames: u64,
+    /// Least time between two publications of one session's map, milliseconds.
+    pub publish_interval_ms: u64,
+    /// Time after which a session without a stream leaves memory (its map stays readable), seconds.
+    pub unload_after_s: u64,
+    /// Time between pings that find dead connections, seconds, at least 1.
+    pub keep_alive_s: u64,
+    /// Time that a shutdown gives open streams and connections to end, seconds.
+    pub shutdown_grace_s: u64,
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        let limits = FrameLimits::default();
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            data_dir: PathBuf::from("lanemap-data"),
+            max_message_bytes: 32 * 1024 * 1024,
+            max_detections: limits.max_detections,
+            max_points_per_detection: limits.max_points_per_detection,
+            max_point_range_m: limits.max_point_range_m,
+            max_odometry_range_m: limits.max_odometry_range_m,
+            max_sessions: 100_000,
+            max_live_sessions: 4096,
+            max_connections: 8192,
+            max_frames_in_flight: 64,
+            max_frames_per_commit: 2048,
+            snapshot_every_frames: 1000,
+            publish_interval_ms: 150,
+            unload_after_s: 60,
+            keep_alive_s: 20,
+            shutdown_grace_s: 8,
+        }
+    }
+}
+
+/// Why settings cannot be used.
+#[derive(Debug, Error)]
+pub enum ConfigError {
+    /// The file or the environment does not read as settings.
+    #[error("settings: {0}")]
+    Read(#[from] config::ConfigError),
+    /// A setting lies outside its range.
+    #[error("setting {name} = {value} is outside {limit}")]
+    OutOfRange {
+        /// Name of the setting.
+        name: &'static str,
+        /// Its value.
+        value: String,
+        /// Its range.
+        limit: &'static str,
+    },
+}
+
+impl ServerConfig {
+    /// Reads the settings: `overrides` (flags) over the environment (`LANEMAP_*`) over `file` (YAML) over defaults.
+    ///
+    /// # Errors
+    /// A file that cannot be read, a name that is no setting, a value of the wrong type or out of range.
+    pub fn load(file: Option<&Path>, overrides: ConfigOverrides) -> Result<Self, ConfigError> {
+        let environment = config::Environment::with_prefix("LANEMAP").try_parsing(true);
+        Self::from_sources(file, environment, overrides)
+    }
+
+    fn from_sources(
+        file: Option<&Path>,
+        environment: config::Environment,
+        overrides: ConfigOverrides,
+    ) -> Result<Self, ConfigError> {
+        let mut builder = config::Config::builder();
+        if let Some(path) = file {
+            builder = builder.add_source(config::File::from(path).format(config::FileFormat::Yaml));
+        }
+        let mut settings: Self = builder.add_source(environment).build()?.try_deserialize()?;
+        overrides.apply_to(&mut settings);
+        settings.check()?;
+        Ok(settings)
+    }
+
+    /// Checks every range.
+    ///
+    /// # Errors
+    /// The first setting that lies outside its range.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        let within = |name, value: f64, minimum: f64, maximum: f64, limit| {
+            let inside = value >= minimum && value <= maximum;
+            if inside { Ok(()) } else { Err(ConfigError::OutOfRange { name, value: value.to_string(), limit }) }
+        };
+        within("max_message_bytes", self.max_message_bytes as f64, 1024.0, 1024.0 * 1024.0 * 1024.0, "1024 ..= 2^30")?;
+        within("max_detections", self.max_detections as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_points_per_detection", self.max_points_per_detection as f64, 2.0, 1e7, "2 ..= 1e7")?;
+        within("max_point_range_m", self.max_point_range_m, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_odometry_range_m", self.max_odometry_range_m, 1.0, 1e8, "1 ..= 1e8")?;
+        within("max_sessions", self.max_sessions as f64, 1.0, 1e8, "1 ..= 1e8")?;
+        within("max_live_sessions", self.max_live_sessions as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_connections", self.max_connections as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_frames_in_flight", self.max_frames_in_flight as f64, 1.0, 4096.0, "1 ..= 4096")?;
+        within("max_frames_per_commit", self.max_frames_per_commit as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("snapshot_every_frames", self.snapshot_every_frames as f64, 1.0, 1e9, "1 ..= 1e9")?;
+        within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
+        within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
+        within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")
+    }
+
+    /// The bounds on a frame.
+    #[must_use]
+    pub fn frame_limits(&self) -> FrameLimits {
+        FrameLimits {
+            max_detections: self.max_detections,
+            max_points_per_detection: self.max_points_per_detection,
+            max_point_range_m: self.max_point_range_m,
+            max_odometry_range_m: self.max_odometry_range_m,
+        }
+    }
+
+    pub(crate) fn publish_interval(&self) -> Duration {
+        Duration::from_millis(self.publish_interval_ms)
+    }
+
+    pub(crate) fn unload_after(&self) -> Duration {
+        Duration::from_secs(self.unload_after_s)
+    }
+
+    pub(crate) fn keep_alive(&self) -> Duration {
+        Duration::from_secs(self.keep_alive_s)
+    }
+
+    pub(crate) fn shutdown_grace(&self) -> Duration {
+        Duration::from_secs(self.shutdown_grace_s)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{collections::HashMap, io::Write};
+
+    use super::*;
+
+    fn environment(pairs: &[(&str, &str)]) -> config::Environment {
+        let pairs: HashMap<_, _> = pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
+        config::Environment::with_prefix("LANEMAP").try_parsing(true).source(Some(pairs))
+    }
+
+    fn file(text: &str) -> tempfile::NamedTempFile {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(text.as_bytes()).unwrap();
+        file
+    }
+
+    #[test]
+    fn flags_win_over_environment_over_file_over_defaults() {
+        let yaml = file("max_detections: 10\nmax_sessions: 11\npublish_interval_ms: 12\n");
+        let environment = environment(&[("LANEMAP_MAX_SESSIONS", "21"), ("LANEMAP_PUBLISH_INTERVAL_MS", "22")]);
+        let flags = ConfigOverrides { publish_interval_ms: Some(32), ..ConfigOverrides::default() };
+        let settings = ServerConfig::from_sources(Some(yaml.path()), environment, flags).unwrap();
+        assert_eq!((settings.max_detections, settings.max_sessions, settings.publish_interval_ms), (10, 21, 32));
+        assert_eq!(settings.max_live_sessions, ServerConfig::default().max_live_sessions);
+    }
+
+    #[test]
+    fn a_name_that_is_no_setting_is_refused_by_name() {
+        let yaml = file("max_detection: 10\n");
+        let error = ServerConfig::from_sources(Some(yaml.path()), environment(&[]), ConfigOverrides::default());
+        assert!(error.unwrap_err().to_string().contains("max_detection"));
+        let error =
+            ServerConfig::from_sources(None, environment(&[("LANEMAP_LISTN", "x")]), ConfigOverrides::default());
+        assert!(error.unwrap_err().to_string().contains("listn"));
+    }
+
+    #[test]
+    fn a_setting_out_of_range_is_refused_with_its_limit() {
+        let flags = ConfigOverrides { max_frames_in_flight: Some(0), ..ConfigOverrides::default() };
+        let error = ServerConfig::from_sources(None, environment(&[]), flags).unwrap_err();
+        assert_eq!(error.to_string(), "setting max_frames_in_flight = 0 is outside 1 ..= 4096");
+    }
+
+    #[test]
+    fn addresses_and_folders_read_from_the_environment() {
+        let environment = environment(&[("LANEMAP_LISTEN", "0.0.0.0:9000"), ("LANEMAP_DATA_DIR", "maps")]);
+        let settings = ServerConfig::from_sources(None, environment, ConfigOverrides::default()).unwrap();
+        assert_eq!(settings.listen, SocketAddr::from(([0, 0, 0, 0], 9000)));
+        assert_eq!(settings.data_dir, PathBuf::from("maps"));
+    }
+}

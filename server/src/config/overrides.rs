@@ -1,0 +1,72 @@
+//! Settings given as flags: each is unset or wins over environment and file.
+
+use std::{net::SocketAddr, path::PathBuf};
+
+use super::ServerConfig;
+
+/// The settings of [`ServerConfig`], each of which may be unset.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ConfigOverrides {
+    /// See [`ServerConfig::listen`].
+    pub listen: Option<SocketAddr>,
+    /// See [`ServerConfig::data_dir`].
+    pub data_dir: Option<PathBuf>,
+    /// See [`ServerConfig::max_message_bytes`].
+    pub max_message_bytes: Option<usize>,
+    /// See [`ServerConfig::max_detections`].
+    pub max_detections: Option<usize>,
+    /// See [`ServerConfig::max_points_per_detection`].
+    pub max_points_per_detection: Option<usize>,
+    /// See [`ServerConfig::max_point_range_m`].
+    pub max_point_range_m: Option<f64>,
+    /// See [`ServerConfig::max_odometry_range_m`].
+    pub max_odometry_range_m: Option<f64>,
+    /// See [`ServerConfig::max_sessions`].
+    pub max_sessions: Option<usize>,
+    /// See [`ServerConfig::max_live_sessions`].
+    pub max_live_sessions: Option<usize>,
+    /// See [`ServerConfig::max_connections`].
+    pub max_connections: Option<usize>,
+    /// See [`ServerConfig::max_frames_in_flight`].
+    pub max_frames_in_flight: Option<usize>,
+    /// See [`ServerConfig::max_frames_per_commit`].
+    pub max_frames_per_commit: Option<usize>,
+    /// See [`ServerConfig::snapshot_every_frames`].
+    pub snapshot_every_frames: Option<u64>,
+    /// See [`ServerConfig::publish_interval_ms`].
+    pub publish_interval_ms: Option<u64>,
+    /// See [`ServerConfig::unload_after_s`].
+    pub unload_after_s: Option<u64>,
+    /// See [`ServerConfig::keep_alive_s`].
+    pub keep_alive_s: Option<u64>,
+    /// See [`ServerConfig::shutdown_grace_s`].
+    pub shutdown_grace_s: Option<u64>,
+}
+
+impl ConfigOverrides {
+    pub(super) fn apply_to(self, settings: &mut ServerConfig) {
+        set(&mut settings.listen, self.listen);
+        set(&mut settings.data_dir, self.data_dir);
+        set(&mut settings.max_message_bytes, self.max_message_bytes);
+        set(&mut settings.max_detections, self.max_detections);
+        set(&mut settings.max_points_per_detection, self.max_points_per_detection);
+        set(&mut settings.max_point_range_m, self.max_point_range_m);
+        set(&mut settings.max_odometry_range_m, self.max_odometry_range_m);
+        set(&mut settings.max_sessions, self.max_sessions);
+        set(&mut settings.max_live_sessions, self.max_live_sessions);
+        set(&mut settings.max_connections, self.max_connections);
+        set(&mut settings.max_frames_in_flight, self.max_frames_in_flight);
+        set(&mut settings.max_frames_per_commit, self.max_frames_per_commit);
+        set(&mut settings.snapshot_every_frames, self.snapshot_every_frames);
+        set(&mut settings.publish_interval_ms, self.publish_interval_ms);
+        set(&mut settings.unload_after_s, self.unload_after_s);
+        set(&mut settings.keep_alive_s, self.keep_alive_s);
+        set(&mut settings.shutdown_grace_s, self.shutdown_grace_s);
+    }
+}
+
+fn set<T>(setting: &mut T, flag: Option<T>) {
+    if let Some(value) = flag {
+        *setting = value;
+    }
+}

@@ -1,0 +1,220 @@
+//! The journal: frames are durable before they are acked.
+//!
+//! One folder (fjall) holds the sessions' records, the frames that no snapshot covers yet, and one snapshot per session.
+//! All writes go through one thread that gathers what is waiting, of all sessions, into one atomic batch and one sync to
+//! disk: a crash leaves either all of a batch or nothing of it, and only a batch that was synced is acked.
+
+mod committer;
+mod record;
+mod store;
+
+use std::path::Path;
+
+use lanemap_core::{Frame, Sequence};
+use thiserror::Error;
+use tokio::sync::{mpsc, oneshot};
+
+use crate::session::SessionId;
+pub use committer::CommitterThread;
+use committer::{Commit, Committer};
+pub use record::{SessionKey, SessionRecord, SessionSetup};
+use store::Store;
+
+/// Commits that may wait for the thread; each holds at most one session's frames in flight.
+const WAITING_COMMITS: usize = 4096;
+
+/// Why the journal cannot write or read.
+#[derive(Clone, Debug, Error)]
+pub enum JournalError {
+    /// The embedded store failed; it takes no more writes until it is opened anew.
+    #[error("the store failed: {0}")]
+    Store(String),
+    /// A stored value does not decode.
+    #[error("{what} does not decode: {reason}")]
+    Decode {
+        /// What was read.
+        what: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The journal was closed.
+    #[error("the journal is closed")]
+    Closed,
+}
+
+impl From<fjall::Error> for JournalError {
+    fn from(error: fjall::Error) -> Self {
+        Self::Store(error.to_string())
+    }
+}
+
+/// A frame on its way into the journal.
+#[derive(Clone, Debug)]
+pub struct JournalFrame {
+    /// Number in the session.
+    pub sequence: Sequence,
+    /// The frame's bytes, from [`frame_bytes`].
+    pub bytes: Vec<u8>,
+}
+
+/// The bytes under which a frame is kept: the validated frame, bit by bit.
+///
+/// # Errors
+/// None in practice: a frame is plain numbers.
+pub fn frame_bytes(frame: &Frame) -> Result<Vec<u8>, JournalError> {
+    postcard::to_stdvec(frame).map_err(|error| decode_error("frame", &error))
+}
+
+/// A handle to the journal. Clones share it.
+#[derive(Clone, Debug)]
+pub struct Journal {
+    store: Store,
+    commits: mpsc::Sender<Commit>,
+}
+
+impl Journal {
+    /// Opens the store in `folder`, creating it where it is not there, and starts the committing thread.
+    ///
+    /// # Errors
+    /// A store that is locked by another process, damaged, or in a folder that cannot be written.
+    pub fn open(folder: &Path, max_frames_per_commit: usize) -> Result<(Self, CommitterThread), JournalError> {
+        let store = Store::open(folder)?;
+        let (commits, waiting) = mpsc::channel(WAITING_COMMITS);
+        let thread = Committer::new(store.clone(), waiting, max_frames_per_commit).start()?;
+        Ok((Self { store, commits }, thread))
+    }
+
+    /// Makes frames of one session durable; they are on the disk when this returns.
+    ///
+    /// # Errors
+    /// The store failed: none of the frames counts as durable.
+    pub async fn append(&self, session: SessionId, frames: Vec<JournalFrame>) -> Result<(), JournalError> {
+        self.commit(|done| Commit::Frames { session, frames, done }).await
+    }
+
+    /// Makes a session's record durable.
+    ///
+    /// # Errors
+    /// The store failed.
+    pub async fn put_record(&self, record: SessionRecord) -> Result<(), JournalError> {
+        self.commit(|done| Commit::Record { record, done }).await
+    }
+
+    /// Makes a snapshot durable and removes the frames up to `covered`, which it makes needless, in one step.
+    ///
+    /// # Errors
+    /// The store failed: the old snapshot and the frames stay.
+    pub async fn put_snapshot(
+        &self,
+        session: SessionId,
+        covered: Sequence,
+        bytes: Vec<u8>,
+    ) -> Result<(), JournalError> {
+        self.commit(|done| Commit::Snapshot { session, covered, bytes, done }).await
+    }
+
+    async fn commit(
+        &self,
+        commit: impl FnOnce(oneshot::Sender<Result<(), JournalError>>) -> Commit,
+    ) -> Result<(), JournalError> {
+        let (done, outcome) = oneshot::channel();
+        self.commits.send(commit(done)).await.map_err(|_| JournalError::Closed)?;
+        outcome.await.map_err(|_| JournalError::Closed)?
+    }
+
+    /// Every session's record, in the order of the ids. Reads the disk.
+    ///
+    /// # Errors
+    /// The store cannot be read, or a record does not decode.
+    pub fn records(&self) -> Result<Vec<SessionRecord>, JournalError> {
+        self.store.records()
+    }
+
+    /// One session's record, where it has one. Reads the disk.
+    ///
+    /// # Errors
+    /// The store cannot be read, or the record does not decode.
+    pub fn record(&self, session: SessionId) -> Result<Option<SessionRecord>, JournalError> {
+        self.store.record(session)
+    }
+
+    /// A session's snapshot bytes, where it has one. Reads the disk.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn snapshot(&self, session: SessionId) -> Result<Option<Vec<u8>>, JournalError> {
+        self.store.snapshot(session)
+    }
+
+    /// The frames of a session that its snapshot does not cover, in the order of their sequence. Reads the disk.
+    pub fn frames(&self, session: SessionId) -> impl Iterator<Item = Result<Frame, JournalError>> {
+        self.store.frames(session)
+    }
+}
+
+fn decode_error(what: &str, error: &postcard::Error) -> JournalError {
+    JournalError::Decode { what: what.to_owned(), reason: error.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use lanemap_core::{FrameLimits, FrameParts, Odometry, Preset, Sensor, TimestampNs, geometry::Pose};
+
+    use super::*;
+
+    fn frame(sequence: u64) -> Frame {
+        let odometry = Odometry { odometry_from_vehicle: Pose::identity(), motion_covariance: None };
+        let time = TimestampNs(i64::try_from(sequence).unwrap());
+        let parts = FrameParts { sequence: Sequence(sequence), time, odometry, gnss: None, detections: vec![] };
+        Frame::new(parts, &FrameLimits::default()).unwrap()
+    }
+
+    fn journaled(sequences: impl IntoIterator<Item = u64>) -> Vec<JournalFrame> {
+        let frames = sequences.into_iter().map(frame);
+        frames.map(|f| JournalFrame { sequence: f.sequence(), bytes: frame_bytes(&f).unwrap() }).collect()
+    }
+
+    fn record(id: SessionId) -> SessionRecord {
+        let key = SessionKey { fleet: "f".into(), vehicle: "v".into(), drive: id.to_string() };
+        SessionRecord {
+            id,
+            key,
+            setup: SessionSetup { preset: Preset::Paper, sensor: Sensor::default() },
+            ended: false,
+        }
+    }
+
+    fn sequences(journal: &Journal, session: SessionId) -> Vec<u64> {
+        journal.frames(session).map(|frame| frame.unwrap().sequence().0).collect()
+    }
+
+    #[tokio::test]
+    async fn what_was_appended_is_there_when_the_folder_is_opened_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, second) = (SessionId::next(None, 1), SessionId::next(None, 2));
+        let (journal, thread) = Journal::open(folder.path(), 100).unwrap();
+        journal.put_record(record(first)).await.unwrap();
+        journal.append(first, journaled([1, 2, 256])).await.unwrap();
+        journal.append(second, journaled([7])).await.unwrap();
+        drop(journal);
+        thread.join().await;
+
+        let (journal, _thread) = Journal::open(folder.path(), 100).unwrap();
+        assert_eq!(journal.records().unwrap(), [record(first)]);
+        assert_eq!(sequences(&journal, first), [1, 2, 256]);
+        assert_eq!(sequences(&journal, second), [7]);
+    }
+
+    #[tokio::test]
+    async fn a_snapshot_replaces_the_frames_that_it_covers_and_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, second) = (SessionId::next(None, 1), SessionId::next(None, 2));
+        let (journal, _thread) = Journal::open(folder.path(), 2).unwrap();
+        journal.append(first, journaled(1..=5)).await.unwrap();
+        journal.append(second, journaled(1..=5)).await.unwrap();
+        journal.put_snapshot(first, Sequence(3), b"state".to_vec()).await.unwrap();
+        assert_eq!(journal.snapshot(first).unwrap().as_deref(), Some(&b"state"[..]));
+        assert_eq!(sequences(&journal, first), [4, 5]);
+        assert_eq!(sequences(&journal, second), [1, 2, 3, 4, 5]);
+    }
+}

@@ -1,0 +1,68 @@
+//! Metrics: names in base units, counters end in `_total`, and no label names a vehicle.
+
+use std::sync::OnceLock;
+
+use metrics::{Unit, describe_counter, describe_gauge, describe_histogram};
+use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
+
+/// Frames that were made durable.
+pub const FRAMES_ACKED: &str = "lanemap_frames_acked_total";
+/// Frames that came again and were acked again.
+pub const FRAMES_REPEATED: &str = "lanemap_frames_repeated_total";
+/// Messages refused, by `reason`.
+pub const REFUSALS: &str = "lanemap_refusals_total";
+/// Seconds of one step of a mapper.
+pub const STEP_SECONDS: &str = "lanemap_mapper_step_seconds";
+/// Seconds from a frame's decoding to its ack.
+pub const ACK_SECONDS: &str = "lanemap_frame_ack_seconds";
+/// Seconds of one durable commit of the journal.
+pub const COMMIT_SECONDS: &str = "lanemap_journal_commit_seconds";
+/// Frames in one durable commit.
+pub const COMMIT_FRAMES: &str = "lanemap_journal_commit_frames";
+/// Streams of vehicles that are open.
+pub const SESSIONS_LIVE: &str = "lanemap_sessions_live";
+/// Drives that the store holds.
+pub const SESSIONS: &str = "lanemap_sessions";
+/// Connections that are open.
+pub const CONNECTIONS: &str = "lanemap_connections";
+/// Poses and local maps dropped because their client did not read them.
+pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
+
+/// Buckets of durations, seconds: 10 us to 10 s.
+const SECONDS: [f64; 13] = [1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25, 1.0, 3.0, 10.0];
+
+/// Renders the metrics of this process; installs the recorder at the first call.
+///
+/// Where another recorder was installed before, the handle renders nothing.
+#[must_use]
+pub fn metrics_handle() -> PrometheusHandle {
+    static HANDLE: OnceLock<PrometheusHandle> = OnceLock::new();
+    HANDLE.get_or_init(install).clone()
+}
+
+fn install() -> PrometheusHandle {
+    let builder = PrometheusBuilder::new();
+    // `set_buckets` refuses an empty slice only.
+    let builder = builder.set_buckets(&SECONDS).unwrap_or_else(|_| PrometheusBuilder::new());
+    let recorder = builder.build_recorder();
+    let handle = recorder.handle();
+    if metrics::set_global_recorder(recorder).is_err() {
+        tracing::warn!("another metrics recorder is installed: /metrics stays empty");
+    }
+    describe();
+    handle
+}
+
+fn describe() {
+    describe_counter!(FRAMES_ACKED, Unit::Count, "Frames that were made durable");
+    describe_counter!(FRAMES_REPEATED, Unit::Count, "Frames that came again and were acked again");
+    describe_counter!(REFUSALS, Unit::Count, "Messages refused, by reason");
+    describe_histogram!(STEP_SECONDS, Unit::Seconds, "One step of a mapper");
+    describe_histogram!(ACK_SECONDS, Unit::Seconds, "From a frame's decoding to its ack");
+    describe_histogram!(COMMIT_SECONDS, Unit::Seconds, "One durable commit of the journal");
+    describe_histogram!(COMMIT_FRAMES, Unit::Count, "Frames in one durable commit");
+    describe_gauge!(SESSIONS_LIVE, Unit::Count, "Streams of vehicles that are open");
+    describe_gauge!(SESSIONS, Unit::Count, "Drives that the store holds");
+    describe_gauge!(CONNECTIONS, Unit::Count, "Connections that are open");
+    describe_counter!(UPDATES_DROPPED, Unit::Count, "Poses and local maps that their client did not read in time");
+}

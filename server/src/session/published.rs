@@ -10,7 +10,10 @@ use std::{
 };
 
 use arc_swap::ArcSwap;
-use lanemap_core::{LaneMap, Preset, Sequence, TimestampNs, geometry::Pose};
+use lanemap_core::{
+    LaneMap, Preset, Sequence, TimestampNs,
+    geometry::{Pose, georeference::Georeference},
+};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
@@ -36,13 +39,6 @@ pub enum SessionState {
     Idle,
     /// The drive is over.
     Closed,
-}
-
-/// Where on the earth a map frame lies.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Georeference {
-    /// The map frame in the east-north-up frame at the anchor.
-    pub enu_from_map: Pose,
 }
 
 /// One version of a session's map.

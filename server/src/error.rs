@@ -1,0 +1,94 @@
+//! What can go wrong for a vehicle or a reader of maps, once, with its gRPC status.
+//!
+//! A message that is not valid is no error: it is a [`Refusal`], and its stream goes on. The HTTP side's own refusals
+//! are problem documents ([`crate::serve`]).
+
+use thiserror::Error;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use crate::{ingest::Refusal, journal::JournalError, session::SessionId};
+
+/// A failure that ends a call or a stream.
+#[derive(Clone, Debug, Error)]
+pub enum Error {
+    /// A unary call's message, or a stream's hundredth, was refused.
+    #[error("{0}")]
+    Refused(Box<Refusal>),
+    /// No such session.
+    #[error("there is no session {session}")]
+    NoSuchSession {
+        /// The name that was asked for.
+        session: String,
+    },
+    /// A newer stream of the same drive took over.
+    #[error("a newer stream of this drive has taken over")]
+    Superseded,
+    /// The service is shutting down; the drive can be resumed elsewhere or later.
+    #[error("the service is shutting down; resume the drive on another connection")]
+    ShuttingDown,
+    /// Frames cannot be made durable.
+    #[error("frames cannot be made durable: {0}")]
+    Journal(#[from] JournalError),
+    /// What the store holds of a session cannot be read by this build.
+    #[error("session {session} cannot be read from the store: {reason}")]
+    Unreadable {
+        /// The session.
+        session: SessionId,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The session's actor ended while it was being spoken to; a new attempt starts another.
+    #[error("the session has ended; try again")]
+    SessionGone,
+}
+
+impl Error {
+    /// The gRPC code.
+    #[must_use]
+    pub fn code(&self) -> Code {
+        match self {
+            Self::Refused(_) => Code::InvalidArgument,
+            Self::NoSuchSession { .. } => Code::NotFound,
+            Self::Superseded => Code::Aborted,
+            Self::ShuttingDown | Self::Journal(_) | Self::SessionGone => Code::Unavailable,
+            Self::Unreadable { .. } => Code::DataLoss,
+        }
+    }
+
+    fn details(&self) -> Option<ErrorDetails> {
+        match self {
+            Self::Refused(refusal) => {
+                Some(ErrorDetails::with_bad_request_violation(&refusal.field, refusal.to_string()))
+            }
+            Self::NoSuchSession { session } => {
+                Some(ErrorDetails::with_resource_info("session", session, "", "no such session"))
+            }
+            _ => None,
+        }
+    }
+}
+
+impl From<Error> for Status {
+    fn from(error: Error) -> Self {
+        match error.details() {
+            Some(details) => Self::with_error_details(error.code(), error.to_string(), details),
+            None => Self::new(error.code(), error.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use lanemap_proto::v1::RefusalReason;
+
+    #[test]
+    fn a_refusal_tells_a_machine_which_field_it_was() {
+        let refusal = Refusal::new(RefusalReason::Missing, "start.sensor", "nothing", "required");
+        let status = Status::from(Error::Refused(Box::new(refusal)));
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let violation = &status.get_details_bad_request().unwrap().field_violations[0];
+        assert_eq!(violation.field, "start.sensor");
+    }
+}

@@ -1,0 +1,224 @@
+//! Starts and stops the service.
+
+use std::{net::SocketAddr, sync::Arc, time::Duration};
+
+use axum::Router;
+use lanemap_proto::v1::{self, ingest_service_server::IngestServiceServer, map_service_server::MapServiceServer};
+use thiserror::Error;
+use tokio::{net::TcpListener, sync::watch, task::JoinHandle, time::timeout};
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
+use tonic::{codec::CompressionEncoding, service::Routes};
+use tonic_health::{ServingStatus, server::HealthReporter};
+
+use crate::{
+    config::{ConfigError, ServerConfig},
+    ingest::IngestGrpc,
+    journal::{CommitterThread, Journal, JournalError},
+    listener,
+    map_service::MapGrpc,
+    serve::{self, ServeState},
+    session::{Sessions, actor::Surroundings, registry::SessionRegistry},
+    telemetry,
+};
+
+/// Time between two clean-ups of the metrics' histograms.
+const METRICS_UPKEEP: Duration = Duration::from_secs(5);
+
+/// Why the service does not start.
+#[derive(Debug, Error)]
+pub enum StartError {
+    /// A setting is out of range.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The store cannot be opened.
+    #[error("the store in {folder}: {source}")]
+    Journal {
+        /// The folder.
+        folder: String,
+        /// What is wrong with it.
+        source: JournalError,
+    },
+    /// The address cannot be listened on.
+    #[error("listening on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What is wrong with it.
+        source: std::io::Error,
+    },
+    /// The descriptors for reflection do not read.
+    #[error("gRPC reflection: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// The service.
+#[derive(Debug)]
+pub struct Server;
+
+/// A service that runs. Stop it with [`RunningServer::shutdown`]; dropped, it stops in the background.
+#[derive(Debug)]
+pub struct RunningServer {
+    address: SocketAddr,
+    sessions: Sessions,
+    shutdown: CancellationToken,
+    task: JoinHandle<()>,
+}
+
+impl Server {
+    /// Opens the store, reads every session in it, and serves gRPC and HTTP on one port.
+    ///
+    /// # Errors
+    /// A setting out of range, a store that cannot be opened, an address that cannot be listened on.
+    pub async fn start(config: ServerConfig) -> Result<RunningServer, StartError> {
+        config.check()?;
+        let metrics = telemetry::metrics_handle();
+        let config = Arc::new(config);
+        let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
+        let (journal, committer) = Journal::open(&config.data_dir, config.max_frames_per_commit).map_err(in_store)?;
+        let (sessions, shutdown) = (Sessions::default(), CancellationToken::new());
+        let surroundings = Surroundings {
+            config: Arc::clone(&config),
+            journal,
+            sessions: sessions.clone(),
+            shutdown: shutdown.clone(),
+        };
+        let registry = SessionRegistry::recover(surroundings).await.map_err(in_store)?;
+
+        let listen_error = |source| StartError::Listen { address: config.listen, source };
+        let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
+        let address = listener.local_addr().map_err(listen_error)?;
+
+        let (ready, is_ready) = watch::channel(true);
+        let http = ServeState { sessions: sessions.clone(), metrics, ready: is_ready, shutdown: shutdown.clone() };
+        let streams = TaskTracker::new();
+        let ingest = IngestGrpc::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
+        let (health, router) = router(&config, ingest, http).await?;
+
+        let running = Running { config, registry, streams, ready, health, shutdown: shutdown.clone(), committer };
+        let task = tokio::spawn(running.run(listener, router));
+        tracing::info!(%address, "serving gRPC and HTTP");
+        Ok(RunningServer { address, sessions, shutdown, task })
+    }
+}
+
+impl RunningServer {
+    /// Where gRPC and HTTP are served.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The address as a URL, for clients on this machine.
+    #[must_use]
+    pub fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// The published maps.
+    #[must_use]
+    pub fn sessions(&self) -> &Sessions {
+        &self.sessions
+    }
+
+    /// Begins a shutdown when cancelled; e.g. from a signal handler.
+    #[must_use]
+    pub fn shutdown_token(&self) -> CancellationToken {
+        self.shutdown.clone()
+    }
+
+    /// Stops: readiness falls, streams end with what they were promised, drives are saved, the port and the store close.
+    pub async fn shutdown(self) {
+        self.shutdown.cancel();
+        self.stopped().await;
+    }
+
+    /// Waits until the service has stopped.
+    pub async fn stopped(mut self) {
+        if let Err(error) = (&mut self.task).await {
+            tracing::error!(%error, "the service did not stop cleanly");
+        }
+    }
+}
+
+impl Drop for RunningServer {
+    fn drop(&mut self) {
+        self.shutdown.cancel();
+    }
+}
+
+/// What a service that runs must stop, in the order in which it stops.
+struct Running {
+    config: Arc<ServerConfig>,
+    registry: SessionRegistry,
+    streams: TaskTracker,
+    ready: watch::Sender<bool>,
+    health: HealthReporter,
+    shutdown: CancellationToken,
+    committer: CommitterThread,
+}
+
+impl Running {
+    async fn run(self, listener: TcpListener, router: Router) {
+        let stop_listening = CancellationToken::new();
+        let grace = self.config.shutdown_grace();
+        let serving = tokio::spawn({
+            let (config, stop) = (Arc::clone(&self.config), stop_listening.clone());
+            async move { listener::serve(listener, router, &config, stop, grace).await }
+        });
+        let upkeep = tokio::spawn(async {
+            loop {
+                tokio::time::sleep(METRICS_UPKEEP).await;
+                telemetry::metrics_handle().run_upkeep();
+            }
+        });
+        self.shutdown.cancelled().await;
+
+        tracing::info!("shutting down");
+        self.ready.send_replace(false);
+        self.health.set_service_status("", ServingStatus::NotServing).await;
+        self.health.set_not_serving::<IngestServiceServer<IngestGrpc>>().await;
+        self.streams.close();
+        let sessions_left = async {
+            self.streams.wait().await;
+            self.registry.stopped().await;
+        };
+        if timeout(grace, sessions_left).await.is_err() {
+            tracing::warn!("some sessions had not left at the end of the grace time; what they acked is durable");
+        }
+        stop_listening.cancel();
+        if let Err(error) = serving.await {
+            tracing::error!(%error, "the listener failed");
+        }
+        upkeep.abort();
+        drop(self.registry);
+        if timeout(grace, self.committer.join()).await.is_err() {
+            tracing::warn!("the journal was still in use at the end of the grace time");
+        }
+    }
+}
+
+/// gRPC beside HTTP on one router. Unknown paths are the HTTP side's to answer.
+async fn router(
+    config: &ServerConfig,
+    ingest: IngestGrpc,
+    http: ServeState,
+) -> Result<(HealthReporter, Router), StartError> {
+    let (reporter, health) = tonic_health::server::health_reporter();
+    reporter.set_serving::<IngestServiceServer<IngestGrpc>>().await;
+    reporter.set_serving::<MapServiceServer<MapGrpc>>().await;
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        .build_v1()?;
+    let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone())).send_compressed(CompressionEncoding::Gzip);
+    let ingest = IngestServiceServer::new(ingest)
+        .max_decoding_message_size(config.max_message_bytes)
+        .accept_compressed(CompressionEncoding::Gzip)
+        .accept_compressed(CompressionEncoding::Zstd);
+    let routes = Routes::from(serve::router(http))
+        .add_service(ingest)
+        .add_service(maps)
+        .add_service(health)
+        .add_service(reflection);
+    Ok((reporter, routes.into_axum_router()))
+}

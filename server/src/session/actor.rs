@@ -1,0 +1,388 @@
+//! The actor of one session: the only owner of the drive's mapper.
+//!
+//! It gathers the frames that are waiting, makes them durable in one commit, acks them, maps them, and sends poses back.
+//! It publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
+//! snapshot every so many frames, when the drive ends, and before it leaves memory.
+
+use std::{sync::Arc, time::Duration};
+
+use lanemap_core::{Frame, LocalWindow, Sequence, StepReport};
+use lanemap_proto::{
+    encode,
+    v1::{self, RefusalReason, stream_observations_response::Message},
+};
+use tokio::{
+    sync::{mpsc, oneshot},
+    time::{Instant, sleep_until},
+};
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+
+use super::{
+    SessionRecord, SessionState, Sessions,
+    drive::{Admission, Drive, DriveError},
+};
+use crate::{
+    config::ServerConfig,
+    error::Error,
+    ingest::{Outbox, Refusal},
+    journal::{Journal, JournalError, JournalFrame, frame_bytes},
+    telemetry,
+};
+
+/// Steps of a mapper between two chances for other tasks to run: about a millisecond.
+const STEPS_IN_A_ROW: usize = 8;
+/// A publication may take this share of a session's time at most: one part in so many.
+const PUBLISH_SHARE: u32 = 20;
+
+/// Numbers the streams of one session, so that what a superseded stream still sends is told apart.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct StreamNumber(pub(crate) u64);
+
+/// What an actor is told.
+#[derive(Debug)]
+pub(crate) enum Command {
+    /// A stream of the vehicle opens; a stream before it is superseded.
+    Attach(Attach),
+    /// A validated frame.
+    Frame { stream: StreamNumber, frame: Box<Frame>, arrived: Instant },
+    /// The drive is over.
+    End { stream: StreamNumber },
+    /// The stream closes; what it was promised is sent first, then `with`.
+    Detach { stream: StreamNumber, with: Result<(), Status> },
+}
+
+/// A stream that opens.
+#[derive(Debug)]
+pub(crate) struct Attach {
+    pub(crate) stream: StreamNumber,
+    pub(crate) outbox: Outbox,
+    pub(crate) wants_local_map: bool,
+    /// Cancelled when the stream's task is gone, however it went.
+    pub(crate) gone: CancellationToken,
+    pub(crate) attached: oneshot::Sender<Attached>,
+}
+
+/// Where a session is when a stream opens.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Attached {
+    pub(crate) last: Option<Sequence>,
+    pub(crate) ended: bool,
+}
+
+/// What an actor shares with the rest of the service.
+#[derive(Clone, Debug)]
+pub(crate) struct Surroundings {
+    pub(crate) config: Arc<ServerConfig>,
+    pub(crate) journal: Journal,
+    pub(crate) sessions: Sessions,
+    pub(crate) shutdown: CancellationToken,
+}
+
+pub(crate) struct Actor {
+    surroundings: Surroundings,
+    record: SessionRecord,
+    drive: Drive,
+    commands: mpsc::Receiver<Command>,
+    stream: Option<Stream>,
+    unpublished: bool,
+    next_publication: Instant,
+    unload_at: Instant,
+    frames_since_snapshot: u64,
+}
+
+struct Stream {
+    number: StreamNumber,
+    outbox: Outbox,
+    wants_local_map: bool,
+    gone: CancellationToken,
+}
+
+/// Frames admitted, not yet durable.
+#[derive(Default)]
+struct Batch {
+    frames: Vec<(Frame, Instant)>,
+    journal: Vec<JournalFrame>,
+    repeated: bool,
+}
+
+/// Whether the actor goes on.
+type Outcome = Result<(), ActorError>;
+
+#[derive(Debug, thiserror::Error)]
+enum ActorError {
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+    #[error("the drive's state cannot be saved: {0}")]
+    Drive(#[from] DriveError),
+}
+
+impl Actor {
+    pub(crate) fn new(
+        surroundings: Surroundings,
+        record: SessionRecord,
+        drive: Drive,
+        commands: mpsc::Receiver<Command>,
+    ) -> Self {
+        let now = Instant::now();
+        let unload_at = now + surroundings.config.unload_after();
+        Self {
+            surroundings,
+            record,
+            drive,
+            commands,
+            stream: None,
+            unpublished: false,
+            next_publication: now,
+            unload_at,
+            frames_since_snapshot: 0,
+        }
+    }
+
+    /// Runs until the session leaves memory, the service shuts down, or the journal fails.
+    pub(crate) async fn run(mut self) {
+        if let Err(error) = self.serve().await {
+            tracing::error!(session = %self.record.id, %error, "the session ends");
+            let status = Status::unavailable(error.to_string());
+            self.detach(Err(status));
+        }
+    }
+
+    async fn serve(&mut self) -> Outcome {
+        self.publish();
+        while self.serve_next().await? {}
+        self.commands.close();
+        while let Some(command) = self.commands.recv().await {
+            self.take(command).await?;
+        }
+        self.save().await?;
+        self.publish();
+        Ok(())
+    }
+
+    /// Waits for what comes next; `false` where the actor is no longer needed.
+    async fn serve_next(&mut self) -> Result<bool, ActorError> {
+        let gone = self.stream.as_ref().map(|stream| stream.gone.clone());
+        let detached = gone.is_none();
+        tokio::select! {
+            biased;
+            command = self.commands.recv() => match command {
+                Some(command) => self.take(command).await?,
+                None => return Ok(false),
+            },
+            () = sleep_until(self.next_publication), if self.unpublished => self.publish(),
+            () = cancelled(gone) => self.detach(Ok(())),
+            () = sleep_until(self.unload_at), if detached => return Ok(false),
+            () = self.surroundings.shutdown.cancelled(), if detached => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Takes a command, and the frames that wait behind it, as one batch.
+    async fn take(&mut self, first: Command) -> Outcome {
+        let mut batch = Batch::default();
+        let mut next = Some(first);
+        while let Some(command) = next {
+            match command {
+                Command::Frame { stream, frame, arrived } => self.admit(stream, *frame, arrived, &mut batch).await?,
+                Command::Attach(attach) => {
+                    self.commit(&mut batch).await?;
+                    self.attach(attach);
+                }
+                Command::End { stream } => {
+                    self.commit(&mut batch).await?;
+                    self.end(stream).await?;
+                }
+                Command::Detach { stream, with } => {
+                    self.commit(&mut batch).await?;
+                    if self.is_current(stream) {
+                        self.detach(with);
+                    }
+                }
+            }
+            let full = batch.frames.len() >= self.surroundings.config.max_frames_in_flight;
+            next = if full { None } else { self.commands.try_recv().ok() };
+        }
+        self.commit(&mut batch).await?;
+        self.publish_if_due();
+        Ok(())
+    }
+
+    fn is_current(&self, stream: StreamNumber) -> bool {
+        self.stream.as_ref().is_some_and(|current| current.number == stream)
+    }
+
+    fn attach(&mut self, attach: Attach) {
+        if let Some(before) = self.stream.take() {
+            before.outbox.finish(Err(Error::Superseded.into()));
+        }
+        let attached = Attached { last: self.drive.last_sequence(), ended: self.record.ended };
+        if attach.attached.send(attached).is_err() {
+            return self.detach(Ok(()));
+        }
+        self.stream = Some(Stream {
+            number: attach.stream,
+            outbox: attach.outbox,
+            wants_local_map: attach.wants_local_map,
+            gone: attach.gone,
+        });
+        self.publish();
+    }
+
+    fn detach(&mut self, with: Result<(), Status>) {
+        if let Some(stream) = self.stream.take() {
+            stream.outbox.finish(with);
+        }
+        self.unload_at = Instant::now() + self.surroundings.config.unload_after();
+        self.publish();
+    }
+
+    /// Puts a frame into the batch where it is next in its drive.
+    async fn admit(&mut self, stream: StreamNumber, frame: Frame, arrived: Instant, batch: &mut Batch) -> Outcome {
+        let Some(current) = self.stream.as_ref().filter(|current| current.number == stream) else { return Ok(()) };
+        if self.record.ended {
+            let limit = "no frame after the end of the drive";
+            let refusal = Refusal::new(RefusalReason::OutOfTurn, "frame", "a frame", limit).of_frame(frame.sequence());
+            current.outbox.refuse(&refusal).await;
+            return Ok(());
+        }
+        let bytes = frame_bytes(&frame)?;
+        match self.drive.admit(&frame, &bytes) {
+            Admission::New => {
+                batch.journal.push(JournalFrame { sequence: frame.sequence(), bytes });
+                batch.frames.push((frame, arrived));
+            }
+            Admission::Repeated => {
+                metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
+                batch.repeated = true;
+            }
+            Admission::Refused(refusal) => current.outbox.refuse(&refusal).await,
+        }
+        Ok(())
+    }
+
+    /// Makes the batch durable, acks it, maps it.
+    async fn commit(&mut self, batch: &mut Batch) -> Outcome {
+        let Batch { frames, journal, repeated } = std::mem::take(batch);
+        if frames.is_empty() {
+            if repeated {
+                self.ack();
+            }
+            return Ok(());
+        }
+        self.surroundings.journal.append(self.record.id, journal).await?;
+        self.ack();
+        metrics::counter!(telemetry::FRAMES_ACKED).increment(frames.len() as u64);
+        self.frames_since_snapshot += frames.len() as u64;
+        for some in frames.chunks(STEPS_IN_A_ROW) {
+            for (frame, arrived) in some {
+                self.map(frame, *arrived);
+            }
+            tokio::task::yield_now().await;
+        }
+        if self.frames_since_snapshot >= self.surroundings.config.snapshot_every_frames {
+            self.save().await?;
+        }
+        Ok(())
+    }
+
+    fn ack(&self) {
+        if let (Some(stream), Some(sequence)) = (&self.stream, self.drive.last_sequence()) {
+            stream.outbox.ack(sequence);
+        }
+    }
+
+    fn map(&mut self, frame: &Frame, arrived: Instant) {
+        metrics::histogram!(telemetry::ACK_SECONDS).record(arrived.elapsed().as_secs_f64());
+        let started = Instant::now();
+        let report = self.drive.map(frame);
+        metrics::histogram!(telemetry::STEP_SECONDS).record(started.elapsed().as_secs_f64());
+        self.unpublished = true;
+        let Some(stream) = &self.stream else { return };
+        stream.outbox.update(Message::Pose(pose_update(&report)));
+        if stream.wants_local_map {
+            stream.outbox.update(Message::LocalMap(local_map_update(&report, &self.drive)));
+        }
+    }
+
+    /// Ends the drive: its state is saved, and no frame is taken any more.
+    async fn end(&mut self, stream: StreamNumber) -> Outcome {
+        if !self.is_current(stream) {
+            return Ok(());
+        }
+        if !self.record.ended {
+            self.record.ended = true;
+            self.surroundings.journal.put_record(self.record.clone()).await?;
+            self.save().await?;
+        }
+        // Published before the vehicle hears of it: who waits for the end of a drive reads its whole map.
+        let acked_sequence_inclusive = self.drive.last_sequence().map(|sequence| sequence.0);
+        let stream = self.stream.take();
+        self.detach(Ok(()));
+        if let Some(stream) = stream {
+            stream.outbox.end(v1::SessionEnded { acked_sequence_inclusive });
+            stream.outbox.finish(Ok(()));
+        }
+        Ok(())
+    }
+
+    /// Saves the drive's state where it changed, and trims the journal.
+    async fn save(&mut self) -> Outcome {
+        let Some(covered) = self.drive.last_sequence().filter(|_| self.frames_since_snapshot > 0) else {
+            return Ok(());
+        };
+        let bytes = self.drive.snapshot()?;
+        self.surroundings.journal.put_snapshot(self.record.id, covered, bytes).await?;
+        self.frames_since_snapshot = 0;
+        Ok(())
+    }
+
+    fn publish_if_due(&mut self) {
+        if self.unpublished && Instant::now() >= self.next_publication {
+            self.publish();
+        }
+    }
+
+    fn publish(&mut self) {
+        let state = match (&self.stream, self.record.ended) {
+            (_, true) => SessionState::Closed,
+            (Some(_), false) => SessionState::Live,
+            (None, false) => SessionState::Idle,
+        };
+        let started = Instant::now();
+        self.surroundings.sessions.publish(self.drive.published(self.record.id, state));
+        let now = Instant::now();
+        self.next_publication = now + self.publication_pause(now - started);
+        self.unpublished = false;
+    }
+
+    fn publication_pause(&self, took: Duration) -> Duration {
+        self.surroundings.config.publish_interval().max(took * PUBLISH_SHARE)
+    }
+}
+
+async fn cancelled(token: Option<CancellationToken>) {
+    match token {
+        Some(token) => token.cancelled().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn pose_update(report: &StepReport) -> v1::PoseUpdate {
+    v1::PoseUpdate {
+        sequence: report.sequence.0,
+        map_from_vehicle: Some(encode::pose(&report.map_from_vehicle)),
+        covariance: Some(encode::tangent_covariance(&report.covariance)),
+    }
+}
+
+fn local_map_update(report: &StepReport, drive: &Drive) -> v1::LocalMapUpdate {
+    let lanes = drive.mapper().local_map(&LocalWindow::default());
+    v1::LocalMapUpdate {
+        sequence: report.sequence.0,
+        lanes: lanes.iter().map(encode::local_lane).collect(),
+        born: report.born.iter().map(|born| born.lane.0).collect(),
+        grown: report.grown.iter().map(|lane| lane.0).collect(),
+        dropped: report.dropped.iter().map(|lane| lane.0).collect(),
+    }
+}

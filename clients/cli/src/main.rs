@@ -1,3 +1,50 @@
-//! The `lanemap` command: serve, replay, evaluate, simulate, demo.
+//! The `lanemap` command: serve, replay, simulate, demo.
+//!
+//! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
+//! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
 
-fn main() {}
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+mod replay;
+mod simulate;
+
+/// Streams lane detections into lane maps.
+#[derive(Debug, Parser)]
+#[command(name = "lanemap", version, max_term_width = 110)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Replays recorded drives (OpenLane folders) into a server, or into a mapper in this process.
+    Replay(Box<replay::ReplayArgs>),
+    /// Makes synthetic drives with their truth, as OpenLane folders.
+    Simulate(simulate::SimulateArgs),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    log_to_stderr();
+    let done = match cli.command {
+        Command::Replay(args) => replay::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
+    };
+    match done {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Logs at `info`, or as `RUST_LOG` says.
+fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}

@@ -1,0 +1,124 @@
+//! `lanemap replay`: recorded drives, streamed as if they were driven now.
+//!
+//! A mapper runs in this process on the very frames that are streamed. It is deterministic, so that what it makes of
+//! them is what the server makes of them: step times and the local map of every frame come from it, with `--server` too.
+
+mod frames;
+mod mapper_run;
+mod progress;
+mod rate;
+mod report;
+mod results;
+mod step_times;
+
+use std::{path::PathBuf, process::ExitCode, time::Instant};
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use lanemap_core::{Params, Preset};
+use lanemap_openlane::{DriveFolder, Drives};
+
+use frames::{Disturbance, FrameSource, PreparedFrame};
+use mapper_run::MapperRun;
+use progress::Progress;
+use rate::{Pacer, Rate};
+use report::{DriveReport, ReplayReport};
+use results::ResultWriter;
+
+/// What to replay, how, and where to.
+#[derive(Args, Debug)]
+pub struct ReplayArgs {
+    /// Folder of drives: segment-*/TIMESTAMP.json beside results/segment-*/TIMESTAMP.json
+    #[arg(long, value_name = "DIR")]
+    drives: PathBuf,
+    /// Only drives whose name contains one of these texts
+    #[arg(long, value_name = "NAME,..", value_delimiter = ',')]
+    only: Vec<String>,
+    /// The mapper
+    #[arg(long, value_enum, default_value_t = PresetArg::Default)]
+    preset: PresetArg,
+    /// Odometry noise put between every two frames: standard deviation of yaw (degrees), and of x and y (metres)
+    #[arg(long, value_name = "DEG,M", value_parser = frames::parse_pose_noise, default_value = "0,0")]
+    pose_noise: lanemap_simulator::OdometryNoise,
+    /// Probability that one detection of a frame is left out
+    #[arg(long, value_name = "P", value_parser = frames::parse_probability, default_value_t = 0.0)]
+    drop: f64,
+    /// Seed of noise and drops: the same seed gives the same frames
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+    /// How fast: 1 is as recorded, 10 ten times faster, max as fast as frames are taken
+    #[arg(long, value_name = "1|max", default_value = "max")]
+    rate: Rate,
+    /// Run the mapper in this process only; no server is needed
+    #[arg(long)]
+    local: bool,
+    /// Folder for the online local map of every frame (3 to 50 m ahead, 10 m to each side, what was known at that
+    /// frame), in OpenLane's result format under the drives' own folder and file names
+    #[arg(long, value_name = "OUT")]
+    results_dir: Option<PathBuf>,
+    /// Latitude and longitude (degrees) of the origin of the drives' world: poses become GNSS fixes, those of the drive's
+    /// receiver in every frame, or of a drive that has none the first true pose
+    #[arg(long, value_name = "LAT,LON", value_parser = frames::parse_origin, allow_hyphen_values = true)]
+    origin: Option<lanemap_core::geometry::georeference::Georeference>,
+    /// Print one JSON object on stdout instead of a summary
+    #[arg(long)]
+    json: bool,
+}
+
+/// Which mapper.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum PresetArg {
+    /// The paper's method as it is meant
+    Paper,
+    /// The paper's weaknesses mended
+    Default,
+}
+
+impl From<PresetArg> for Preset {
+    fn from(preset: PresetArg) -> Self {
+        match preset {
+            PresetArg::Paper => Self::Paper,
+            PresetArg::Default => Self::Default,
+        }
+    }
+}
+
+/// Replays the drives one after the other. Frames that cannot be read or are not valid are left out, named on stderr and
+/// in the report, and make the exit code 1; the rest is replayed.
+pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+    let drives = Drives::list(&args.drives, &args.only)
+        .context("no drives to replay; --drives must name a folder of segment-* folders")?;
+    anyhow::ensure!(!drives.is_empty(), "{}: holds no segment-* folder", args.drives.display());
+    let progress = Progress::new(drives.iter().map(DriveFolder::len).sum());
+    let started = Instant::now();
+    let mut reports = Vec::new();
+    for drive in &drives {
+        reports.push(replay_drive(args, drive, &progress)?);
+    }
+    progress.finish();
+    let report = ReplayReport::new(reports, started.elapsed());
+    if args.json {
+        println!("{}", serde_json::to_string(&report)?);
+    } else {
+        print!("{report}");
+    }
+    Ok(if report.is_whole() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn replay_drive(args: &ReplayArgs, drive: &DriveFolder, progress: &Progress) -> anyhow::Result<DriveReport> {
+    let disturbance = Disturbance { pose_noise: args.pose_noise, drop: args.drop, seed: args.seed };
+    let mut source = FrameSource::new(drive, disturbance, args.origin);
+    let mut pacer = Pacer::new(args.rate);
+    let results = args.results_dir.as_ref().map(|root| ResultWriter::new(root, drive.name()));
+    let mut run: Option<MapperRun> = None;
+    for PreparedFrame { frame, annotation } in source.by_ref() {
+        let mapper = run.get_or_insert_with(|| MapperRun::new(Params::preset(args.preset.into()), annotation.sensor()));
+        pacer.wait_for(frame.time());
+        mapper.step(&frame, &annotation);
+        if let Some(results) = &results {
+            results.write(frame.time(), &annotation, mapper.mapper())?;
+        }
+        progress.stepped(mapper.lanes(), 0);
+    }
+    Ok(DriveReport::new(drive.name(), run.as_ref(), source.into_faults()))
+}

@@ -1,0 +1,125 @@
+//! `lanemap simulate`: synthetic drives with their truth.
+
+use std::{path::PathBuf, process::ExitCode};
+
+use anyhow::{Context, bail};
+use clap::{Args, ValueEnum};
+use lanemap_simulator::{
+    OdometryNoise, Scenario, Seed, Simulation, drive::MotionModel, openlane::write_simulation, road::NetworkPlan,
+};
+
+/// Longest road of one simulation, km: frames are held in memory while they are written.
+const MAX_TOTAL_KM: f64 = 500.0;
+
+/// What to simulate.
+#[derive(Args, Debug)]
+pub struct SimulateArgs {
+    /// Folder to write into; made where it does not exist. Gets segment-sim-*, results, maps, network.geojson, index.json
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// The roads
+    #[arg(long, value_enum, default_value_t = Roads::Town)]
+    roads: Roads,
+    /// Number of drives
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    drives: u32,
+    /// Length of each drive, km
+    #[arg(long, value_name = "KM", default_value_t = 1.0, value_parser = positive)]
+    length_km: f64,
+    /// Seed: the same seed and options give the same bytes
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Let all drives take one route, each on lanes and at a speed of its own: a crowd-sourced road
+    #[arg(long)]
+    shared_route: bool,
+    /// Steepest slope of the land, percent
+    #[arg(long, value_name = "PERCENT", default_value_t = 5.0, value_parser = not_negative)]
+    max_grade_percent: f64,
+    /// Slowest cruise speed of a drive, m/s [default: 8 in a town, 12 on a long road]
+    #[arg(long, value_name = "M/S", value_parser = positive)]
+    min_speed_mps: Option<f64>,
+    /// Fastest cruise speed of a drive, m/s [default: 15 in a town, 22 on a long road]
+    #[arg(long, value_name = "M/S", value_parser = positive)]
+    max_speed_mps: Option<f64>,
+}
+
+/// Which road network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Roads {
+    /// A grid of two-way streets with junctions, about 420 m apart
+    Town,
+    /// One long one-way road that never comes back to where it was
+    LongRoad,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    not_negative(text).and_then(|value| if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) })
+}
+
+fn not_negative(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
+    if value.is_finite() && value >= 0.0 { Ok(value) } else { Err(format!("{value} is not a number from 0 up")) }
+}
+
+/// Simulates and writes.
+pub fn run(args: &SimulateArgs) -> anyhow::Result<ExitCode> {
+    let scenario = scenario(args)?;
+    let simulation = Simulation::run(&scenario);
+    write_simulation(&args.out, &scenario, &simulation)
+        .context("the simulation cannot be written; --out must name a folder that can be made")?;
+    let frames: usize = simulation.drives.iter().map(|drive| drive.frames.len()).sum();
+    let length_km: f64 = simulation.drives.iter().map(|drive| drive.length_m() / 1e3).sum();
+    println!(
+        "{} drives, {frames} frames, {length_km:.2} km, seed {} in {}",
+        simulation.drives.len(),
+        args.seed,
+        args.out.display()
+    );
+    Ok(ExitCode::SUCCESS)
+}
+
+fn scenario(args: &SimulateArgs) -> anyhow::Result<Scenario> {
+    let total_km = args.length_km * f64::from(args.drives);
+    if total_km > MAX_TOTAL_KM {
+        bail!("{total_km} km in all are more than {MAX_TOTAL_KM}; lower --drives or --length-km, or simulate in parts");
+    }
+    let length_m = args.length_km * 1e3;
+    let base = match args.roads {
+        Roads::Town => Scenario { network: town_for(length_m), ..Scenario::town(args.seed) },
+        Roads::LongRoad => Scenario::long_road(args.seed, length_m),
+    };
+    let motion = MotionModel {
+        min_speed_mps: args.min_speed_mps.unwrap_or(base.motion.min_speed_mps),
+        max_speed_mps: args.max_speed_mps.unwrap_or(base.motion.max_speed_mps),
+        ..base.motion
+    };
+    if motion.min_speed_mps > motion.max_speed_mps {
+        bail!(
+            "--min-speed-mps {} is above --max-speed-mps {}; give both, the lower first",
+            motion.min_speed_mps,
+            motion.max_speed_mps
+        );
+    }
+    Ok(Scenario {
+        seed: Seed(args.seed),
+        drives: args.drives,
+        length_m,
+        shared_route: args.shared_route || args.roads == Roads::LongRoad,
+        max_grade: args.max_grade_percent / 100.0,
+        // Written poses are true; the reader of the files adds odometry noise.
+        odometry: OdometryNoise::default(),
+        motion,
+        ..base
+    })
+}
+
+/// A town large enough that a drive of this length need not come round again and again.
+fn town_for(length_m: f64) -> NetworkPlan {
+    const SPACING_M: f64 = 420.0;
+    let mut blocks: u16 = 4;
+    let links_m = |blocks: u16| 2.0 * f64::from(blocks) * f64::from(blocks - 1) * SPACING_M;
+    while links_m(blocks) < 2.0 * length_m && blocks < 60 {
+        blocks += 1;
+    }
+    NetworkPlan::Grid { columns: blocks, rows: blocks, spacing_m: SPACING_M }
+}

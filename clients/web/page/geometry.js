@@ -1,0 +1,40 @@
+// Metres, degrees and boxes.
+
+/** Metres of one degree of latitude, on the sphere that web mercator takes the earth for. */
+const METRES_PER_DEGREE = 111319.490793;
+
+/**
+ * A coordinate of a session's own frame, placed at 0, 0: there web mercator keeps distances and angles.
+ * `[x east, y north, z]` in metres becomes `[longitude, latitude]` in degrees.
+ */
+export function placeLocal([x, y]) {
+  return [x / METRES_PER_DEGREE, y / METRES_PER_DEGREE];
+}
+
+/** A GeoJSON geometry of lines in metres, placed at 0, 0. */
+export function placeLocalGeometry({ type, coordinates }) {
+  const line = (points) => points.map(placeLocal);
+  return { type, coordinates: type === "MultiLineString" ? coordinates.map(line) : line(coordinates) };
+}
+
+/** A box `[west, south, east, north]` in metres, placed at 0, 0. */
+export function placeLocalBox([west, south, east, north]) {
+  return [...placeLocal([west, south]), ...placeLocal([east, north])];
+}
+
+/** The smallest box around boxes, or `undefined` where there is none. Boxes over the antimeridian are not joined. */
+export function joinBoxes(boxes) {
+  if (boxes.length === 0) return undefined;
+  return [0, 1, 2, 3].map((side) => (side < 2 ? Math.min : Math.max)(...boxes.map((box) => box[side])));
+}
+
+/** Degrees of latitude, and of longitude at `latitude`, that `metres` span. */
+export function degreesOf(metres, latitude) {
+  const north = metres / METRES_PER_DEGREE;
+  return { north, east: north / Math.cos((latitude * Math.PI) / 180) };
+}
+
+/** Metres on the ground that one pixel spans at a zoom, at a latitude (MapLibre's world is 512 pixels at zoom 0). */
+export function metresPerPixel(zoom, latitude) {
+  return ((360 * METRES_PER_DEGREE) / 512 / 2 ** zoom) * Math.cos((latitude * Math.PI) / 180);
+}

@@ -1,10 +1,42 @@
 //! The HTTP side: maps for consumers, health and metrics for operators.
+//!
+//! | address | answer |
+//! |---|---|
+//! | `/sessions` | the drives, newest first: state, version, where they are; `limit` |
+//! | `/sessions/{id}/lanes.geojson` | the lanes of one drive in WGS84; `?crs=local`: in metres |
+//! | `/sessions/{id}/lanes.pb` | the same lanes as splines, protobuf `lanemap.v1.LaneMap` |
+//! | `/collections/lanes/items` | the lanes of all georeferenced drives; `bbox`, `limit` |
+//! | `/viewer` | a page that draws them |
+//! | `/healthz`, `/readyz`, `/metrics` | for operators |
+//!
+//! Answers carry strong entity tags; refusals are RFC 9457 problem documents.
 
-use axum::{Router, routing::get};
+pub mod bounds;
+pub mod entity_tag;
+pub mod features;
+mod items;
+pub mod line;
+mod operation;
+pub mod problem;
+mod query;
+#[cfg(test)]
+mod sample;
+mod sessions;
+mod viewer;
+
+use axum::{
+    Router,
+    http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header},
+    middleware,
+    response::{IntoResponse, Response},
+    routing::get,
+};
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+use tower_http::{compression::CompressionLayer, cors::CorsLayer};
 
+use self::problem::{Problem, repeated};
 use crate::session::Sessions;
 
 /// What the HTTP handlers read.
@@ -20,7 +52,49 @@ pub struct ServeState {
     pub shutdown: CancellationToken,
 }
 
-/// Every HTTP route of the service.
+/// Every HTTP route of the service, and the answer to requests that no route takes.
 pub fn router(state: ServeState) -> Router {
-    Router::new().route("/healthz", get(|| async { "ok\n" })).with_state(state)
+    Router::new()
+        .route("/sessions", get(sessions::list))
+        .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
+        .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
+        .route(items::PATH, get(items::items))
+        .route("/viewer", get(viewer::page))
+        .route("/viewer/{name}", get(viewer::file))
+        .route("/healthz", get(operation::healthz))
+        .route("/readyz", get(operation::readyz))
+        .route("/metrics", get(operation::metrics))
+        .fallback(no_such_path)
+        .method_not_allowed_fallback(method_not_allowed)
+        .layer(CompressionLayer::new())
+        .layer(middleware::from_fn(entity_tag::tell_compressed_apart))
+        .layer(CorsLayer::permissive().expose_headers([header::ETAG]))
+        .with_state(state)
+}
+
+/// HTTP status and a problem document for HTTP; for gRPC, which reads trailers only, its own "unimplemented".
+async fn no_such_path(uri: Uri, headers: HeaderMap) -> Response {
+    let is_grpc = headers
+        .get(header::CONTENT_TYPE)
+        .is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"));
+    if is_grpc {
+        let unimplemented = [
+            (header::CONTENT_TYPE, HeaderValue::from_static("application/grpc")),
+            (header::HeaderName::from_static("grpc-status"), HeaderValue::from_static("12")),
+        ];
+        return (StatusCode::OK, unimplemented).into_response();
+    }
+    Problem::NoSuchPath { path: repeated(uri.path()) }.into_response()
+}
+
+async fn method_not_allowed(method: Method) -> Problem {
+    Problem::MethodNotAllowed { method }
+}
+
+/// Runs work that takes milliseconds where it delays no other request.
+async fn in_background<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Problem> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| {
+        tracing::error!(%error, "an answer could not be made");
+        Problem::Internal
+    })
 }

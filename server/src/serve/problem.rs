@@ -1,0 +1,179 @@
+//! Why a request is refused, as an RFC 9457 problem document (`application/problem+json`).
+
+use axum::{
+    http::{HeaderValue, Method, StatusCode, header},
+    response::{IntoResponse, Response},
+};
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::session::SessionId;
+
+/// Every reason for which the HTTP side refuses.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub enum Problem {
+    /// No such address.
+    #[error("there is nothing at {path:?}")]
+    NoSuchPath {
+        /// The path of the request.
+        path: String,
+    },
+    /// The address is there, the method is not.
+    #[error("{method} is not allowed here; the Allow header names what is")]
+    MethodNotAllowed {
+        /// The method of the request.
+        method: Method,
+    },
+    /// The address names a session that is not there.
+    #[error("there is no session {session:?}; /sessions lists those that there are")]
+    NoSuchSession {
+        /// The name in the address.
+        session: String,
+    },
+    /// Degrees were asked of a session that has none.
+    #[error(
+        "session {session} has no place on the earth: its GNSS fixes, if any, do not tell yet; \
+         ?crs=local gives its lanes in metres, in its own map frame"
+    )]
+    NotGeoreferenced {
+        /// The session.
+        session: SessionId,
+    },
+    /// A query parameter that the address does not know.
+    #[error("parameter {name:?} is not known here; known: {known}")]
+    UnknownParameter {
+        /// Its name.
+        name: String,
+        /// The names that are known, separated by commas.
+        known: String,
+    },
+    /// A query parameter that stands twice.
+    #[error("parameter {name:?} stands more than once")]
+    RepeatedParameter {
+        /// Its name.
+        name: String,
+    },
+    /// A query parameter whose value cannot be read.
+    #[error("parameter {name:?} = {value:?}: {reason}")]
+    BadParameter {
+        /// Its name.
+        name: &'static str,
+        /// Its value, the first 64 characters.
+        value: String,
+        /// What is wrong, and what would be right.
+        reason: String,
+    },
+    /// The query is not `name=value` pairs.
+    #[error("the query cannot be read: {reason}")]
+    BadQuery {
+        /// What is wrong.
+        reason: String,
+    },
+    /// The answer could not be made; the fault is ours.
+    #[error("the answer could not be made")]
+    Internal,
+}
+
+/// The document, as it goes over the wire.
+#[derive(Serialize)]
+struct Document<'a> {
+    #[serde(rename = "type")]
+    kind: String,
+    title: &'static str,
+    status: u16,
+    detail: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parameter: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    alternate: Option<String>,
+}
+
+/// Most characters of a request that a refusal repeats.
+const MOST_REPEATED: usize = 64;
+
+/// The beginning of a text from a request, short enough to repeat.
+#[must_use]
+pub fn repeated(text: &str) -> String {
+    text.chars().take(MOST_REPEATED).collect()
+}
+
+impl Problem {
+    /// Status of the answer.
+    #[must_use]
+    pub fn status(&self) -> StatusCode {
+        match self {
+            Self::NoSuchPath { .. } | Self::NoSuchSession { .. } => StatusCode::NOT_FOUND,
+            Self::MethodNotAllowed { .. } => StatusCode::METHOD_NOT_ALLOWED,
+            Self::NotGeoreferenced { .. } => StatusCode::CONFLICT,
+            Self::UnknownParameter { .. }
+            | Self::RepeatedParameter { .. }
+            | Self::BadParameter { .. }
+            | Self::BadQuery { .. } => StatusCode::BAD_REQUEST,
+            Self::Internal => StatusCode::INTERNAL_SERVER_ERROR,
+        }
+    }
+
+    /// Last part of the problem's type, and its title.
+    fn kind(&self) -> (&'static str, &'static str) {
+        match self {
+            Self::NoSuchPath { .. } => ("no-such-path", "No such path"),
+            Self::MethodNotAllowed { .. } => ("method-not-allowed", "Method not allowed"),
+            Self::NoSuchSession { .. } => ("no-such-session", "No such session"),
+            Self::NotGeoreferenced { .. } => ("not-georeferenced", "The session is not georeferenced"),
+            Self::UnknownParameter { .. } => ("unknown-parameter", "Unknown query parameter"),
+            Self::RepeatedParameter { .. } => ("repeated-parameter", "Repeated query parameter"),
+            Self::BadParameter { .. } => ("bad-parameter", "Malformed query parameter"),
+            Self::BadQuery { .. } => ("bad-query", "Malformed query"),
+            Self::Internal => ("internal", "Internal error"),
+        }
+    }
+
+    fn document(&self) -> Document<'_> {
+        let (kind, title) = self.kind();
+        Document {
+            kind: format!("urn:lanemap:problem:{kind}"),
+            title,
+            status: self.status().as_u16(),
+            detail: self.to_string(),
+            parameter: match self {
+                Self::UnknownParameter { name, .. } | Self::RepeatedParameter { name } => Some(name),
+                Self::BadParameter { name, .. } => Some(name),
+                _ => None,
+            },
+            alternate: match self {
+                Self::NotGeoreferenced { session } => Some(format!("/sessions/{session}/lanes.geojson?crs=local")),
+                _ => None,
+            },
+        }
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let body = serde_json::to_vec(&self.document()).unwrap_or_default();
+        let headers = [
+            (header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json")),
+            (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
+        ];
+        (self.status(), headers, body).into_response()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_session_off_the_earth_is_refused_with_the_address_of_its_metres() {
+        let session = SessionId::next(None, 1);
+        let document = serde_json::to_value(Problem::NotGeoreferenced { session }.document()).unwrap();
+        assert_eq!(document["status"], 409);
+        assert_eq!(document["type"], "urn:lanemap:problem:not-georeferenced");
+        assert_eq!(document["alternate"], format!("/sessions/{session}/lanes.geojson?crs=local"));
+    }
+
+    #[test]
+    fn a_long_text_of_a_request_is_repeated_in_part_only() {
+        assert_eq!(repeated(&"x".repeat(1000)).len(), MOST_REPEATED);
+    }
+}

@@ -1,0 +1,268 @@
+//! `/sessions`: which drives there are, and the lanes of each.
+
+use std::sync::Arc;
+
+use axum::{
+    Json,
+    extract::{Path, State},
+    http::{HeaderMap, Uri, header},
+    response::Response,
+};
+use lanemap_core::{LaneMap, geometry::georeference::Wgs84};
+use nalgebra::{Isometry3, Point3};
+use prost::Message;
+use serde::Serialize;
+
+use super::{
+    ServeState,
+    bounds::{Bounds, extent},
+    entity_tag::EntityTag,
+    features::{Crs, rfc3339, session_lanes},
+    in_background,
+    line::{Coordinate, in_metres, rounded, written},
+    problem::{Problem, repeated},
+    query::{Parameters, parse_limit},
+};
+use crate::{
+    map_service::lane_map,
+    session::{PublishedMap, SessionId, SessionState, Sessions},
+};
+
+/// Media type of GeoJSON.
+pub(super) const GEOJSON: &str = "application/geo+json";
+/// Media type of protobuf.
+const PROTOBUF: &str = "application/x-protobuf";
+
+/// A link to a related resource.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Link {
+    pub rel: &'static str,
+    #[serde(rename = "type")]
+    pub media_type: &'static str,
+    pub href: String,
+}
+
+/// Sessions of a page, where the query does not say.
+const DEFAULT_LIMIT: usize = 1_000;
+/// Most sessions of a page.
+const MOST_SESSIONS: usize = 10_000;
+
+/// A page of sessions, the newest first.
+#[derive(Serialize)]
+struct SessionList {
+    /// Number of sessions, on all pages.
+    total: usize,
+    sessions: Vec<Entry>,
+    links: Vec<Link>,
+}
+
+/// One session of the list.
+#[derive(Serialize)]
+struct Entry {
+    id: String,
+    state: SessionState,
+    /// Grows with every frame; the same version has the same map.
+    version: u64,
+    lanes: usize,
+    frames: u64,
+    /// Whether the session has a place on the earth; without one, the members below are metres of its map frame.
+    georeferenced: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    last_frame_at: Option<String>,
+    /// West, south, east and north border of its lanes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bbox: Option<[f64; 4]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    vehicle: Option<Vehicle>,
+    links: Vec<Link>,
+}
+
+/// Where the vehicle of a session was at its last frame. It has no name here.
+#[derive(Debug, PartialEq, Serialize)]
+struct Vehicle {
+    position: Coordinate,
+    /// Clockwise from north, or from the y axis of the map frame, degrees in `[0, 360)`.
+    heading_deg: f64,
+}
+
+/// `GET /sessions`
+pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+    let parameters = Parameters::read(&uri, &["limit", "after"])?;
+    let limit = parameters.get("limit", |text| parse_limit(text, MOST_SESSIONS))?.unwrap_or(DEFAULT_LIMIT);
+    let after = parameters.get("after", |text| text.parse::<SessionId>().map_err(|error| error.to_string()))?;
+    let all = state.sessions.list();
+    let total = all.len();
+    let older = all.into_iter().rev().filter(|map| after.is_none_or(|after| map.session < after));
+    let mut maps: Vec<_> = older.take(limit + 1).collect();
+    let more = maps.len() > limit;
+    maps.truncate(limit);
+
+    let parts: Vec<_> = maps.iter().map(|map| (identity(map), map.state as u8)).collect();
+    let tag = EntityTag::of((total, limit, more, parts));
+    if tag.is_held_by(&headers) {
+        return Ok(tag.not_modified());
+    }
+    let page = in_background(move || {
+        let sessions: Vec<_> = maps.iter().map(|map| entry(map)).collect();
+        let last = sessions.last().filter(|_| more);
+        let next = last.map(|last| Link {
+            rel: "next",
+            media_type: "application/json",
+            href: format!("/sessions?limit={limit}&after={}", last.id),
+        });
+        SessionList { total, links: next.into_iter().collect(), sessions }
+    });
+    Ok(tag.on(Json(page.await?)))
+}
+
+/// What tells one version of one session's map from all others.
+pub(super) fn identity(map: &PublishedMap) -> (u64, u64, bool) {
+    (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
+}
+
+fn entry(map: &PublishedMap) -> Entry {
+    let path = format!("/sessions/{}", map.session);
+    let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
+    let mut links = vec![
+        link("lanes-local", GEOJSON, "lanes.geojson?crs=local"),
+        link("splines", PROTOBUF, "lanes.pb"),
+        Link { rel: "viewer", media_type: "text/html", href: format!("/viewer?session={}", map.session) },
+    ];
+    if map.georeference.is_some() {
+        links.insert(0, link("lanes", GEOJSON, "lanes.geojson"));
+    }
+    Entry {
+        id: map.session.to_string(),
+        state: map.state,
+        version: map.version.0,
+        lanes: map.map.lanes.len(),
+        frames: map.version.0,
+        georeferenced: map.georeference.is_some(),
+        last_frame_at: map.last_sequence.map(|_| rfc3339(map.last_time)),
+        bbox: border(map),
+        vehicle: map.last_sequence.map(|_| vehicle(map)),
+        links,
+    }
+}
+
+fn control_points(lanes: &LaneMap) -> impl Iterator<Item = Point3<f64>> {
+    lanes.lanes.iter().flat_map(|lane| lane.control_points.iter().map(|point| point.position))
+}
+
+fn border(map: &PublishedMap) -> Option<[f64; 4]> {
+    let points = control_points(&map.map);
+    if let Some(georeference) = &map.georeference {
+        return Bounds::around(georeference, points).map(|bounds| bounds.to_array());
+    }
+    let [low, high] = extent(points)?.map(|corner| in_metres(&corner));
+    Some([low[0], low[1], high[0], high[1]])
+}
+
+fn vehicle(map: &PublishedMap) -> Vehicle {
+    let Some(georeference) = &map.georeference else {
+        let (east, north) = forward(&map.map_from_vehicle);
+        return Vehicle { position: in_metres(&origin(&map.map_from_vehicle)), heading_deg: heading_deg(east, north) };
+    };
+    // Heading from two places a metre apart: away from the anchor, north is not the anchor's.
+    let place = |ahead_m: f64| georeference.to_wgs84(&(map.map_from_vehicle * Point3::new(ahead_m, 0.0, 0.0)));
+    let (here, ahead) = (place(0.0), place(1.0));
+    Vehicle { position: written(here), heading_deg: bearing_deg(&here, &ahead) }
+}
+
+fn origin(map_from_vehicle: &Isometry3<f64>) -> Point3<f64> {
+    map_from_vehicle.translation.vector.into()
+}
+
+fn forward(map_from_vehicle: &Isometry3<f64>) -> (f64, f64) {
+    let ahead = map_from_vehicle.rotation * nalgebra::Vector3::x();
+    (ahead.x, ahead.y)
+}
+
+fn bearing_deg(from: &Wgs84, to: &Wgs84) -> f64 {
+    let across = to.longitude_deg - from.longitude_deg;
+    let east = (across - 360.0 * (across / 360.0).round()) * from.latitude_deg.to_radians().cos();
+    heading_deg(east, to.latitude_deg - from.latitude_deg)
+}
+
+fn heading_deg(east: f64, north: f64) -> f64 {
+    rounded(east.atan2(north).to_degrees().rem_euclid(360.0), 10.0) % 360.0
+}
+
+/// `GET /sessions/{id}/lanes.geojson`
+pub(super) async fn lanes_geojson(
+    State(state): State<ServeState>,
+    Path(id): Path<String>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let crs = Parameters::read(&uri, &["crs"])?.get("crs", Crs::parse)?.unwrap_or(Crs::Wgs84);
+    let map = find(&state.sessions, &id)?;
+    if crs == Crs::Wgs84 && map.georeference.is_none() {
+        return Err(Problem::NotGeoreferenced { session: map.session });
+    }
+    let tag = EntityTag::of((identity(&map), crs));
+    if tag.is_held_by(&headers) {
+        return Ok(tag.not_modified());
+    }
+    let body = in_background(move || session_lanes(&map, crs).map(|lanes| serde_json::to_vec(&lanes))).await?;
+    let body = body.and_then(Result::ok).ok_or(Problem::Internal)?;
+    Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
+}
+
+/// `GET /sessions/{id}/lanes.pb`
+pub(super) async fn lanes_protobuf(
+    State(state): State<ServeState>,
+    Path(id): Path<String>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    Parameters::read(&uri, &[])?;
+    let map = find(&state.sessions, &id)?;
+    let tag = EntityTag::of(identity(&map));
+    if tag.is_held_by(&headers) {
+        return Ok(tag.not_modified());
+    }
+    let body = in_background(move || lane_map(&map).encode_to_vec()).await?;
+    Ok(tag.on(([(header::CONTENT_TYPE, PROTOBUF)], body)))
+}
+
+fn find(sessions: &Sessions, id: &str) -> Result<Arc<PublishedMap>, Problem> {
+    id.parse()
+        .ok()
+        .and_then(|session| sessions.get(&session))
+        .ok_or_else(|| Problem::NoSuchSession { session: repeated(id) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::serve::sample::{georeference, published};
+
+    #[test]
+    fn a_vehicle_that_drives_along_an_axis_that_points_north_heads_north() {
+        let mut map = published(1, 1);
+        assert_eq!(vehicle(&map), Vehicle { position: [10.0, 1.0, 0.0], heading_deg: 90.0 });
+        map.georeference = Some(georeference(-170.0, 60.0));
+        let on_the_earth = vehicle(&map);
+        assert!(on_the_earth.heading_deg.min(360.0 - on_the_earth.heading_deg) < 0.1, "{on_the_earth:?}");
+    }
+
+    #[test]
+    fn an_entry_of_the_list_has_the_border_of_its_lanes() {
+        let mut map = published(1, 2);
+        let local = border(&map).unwrap();
+        assert!(local[0].abs() < 1e-9 && local[2] > 50.0, "{local:?}");
+        map.georeference = Some(georeference(11.58, 48.14));
+        let [west, south, east, north] = border(&map).unwrap();
+        assert!(west < east && east <= 11.58 && (48.14..48.141).contains(&north) && south < north);
+    }
+
+    #[test]
+    fn a_session_that_has_seen_no_frame_has_neither_border_nor_vehicle() {
+        let mut map = published(1, 0);
+        map.last_sequence = None;
+        let entry = serde_json::to_value(entry(&map)).unwrap();
+        assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
+        assert_eq!(entry["state"], "live");
+    }
+}

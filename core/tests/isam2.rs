@@ -1,5 +1,7 @@
 //! The banded smoother against GTSAM's iSAM2, on the same factors in the same order (`tests/golden/isam2.py` wrote them).
 
+#![allow(clippy::unwrap_used)] // a test fails where it fails
+
 use lanemap_core::landmark::information::{BandedInformation, Term};
 use nalgebra::{Matrix3, Point3, Vector3};
 use serde::Deserialize;

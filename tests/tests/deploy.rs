@@ -1,5 +1,7 @@
 //! What `deploy/` hands to an operator is true: the example's settings exist, and its comments tell the defaults.
 
+#![allow(clippy::unwrap_used)] // a test fails where it fails
+
 use std::{io::Write, path::Path};
 
 use lanemap_server::{ConfigOverrides, ServerConfig};

@@ -1,1 +1,9 @@
-//! End-to-end promises of lanemap, one file per promise.
+//! End-to-end promises of lanemap, one file per promise, and what they share: a server on a free port, drives to
+//! stream, and a stream that says exactly what it is told to say.
+
+// A test's plumbing fails loudly; clippy's exemption for tests covers `#[test]` functions only.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::missing_panics_doc)]
+
+pub mod drives;
+pub mod raw_stream;
+pub mod servers;

@@ -7,7 +7,10 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+mod demo;
 mod replay;
+mod serve;
+mod signal;
 mod simulate;
 
 /// Streams lane detections into lane maps.
@@ -20,8 +23,12 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Serves vehicles over gRPC and map readers over HTTP.
+    Serve(Box<serve::ServeArgs>),
     /// Replays recorded drives (OpenLane folders) into a server, or into a mapper in this process.
     Replay(Box<replay::ReplayArgs>),
+    /// Serves, with a simulated fleet driving through a town: something to look at.
+    Demo(demo::DemoArgs),
     /// Makes synthetic drives with their truth, as OpenLane folders.
     Simulate(simulate::SimulateArgs),
 }
@@ -30,7 +37,9 @@ fn main() -> ExitCode {
     let cli = Cli::parse();
     log_to_stderr();
     let done = match cli.command {
+        Command::Serve(args) => serve::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };
     match done {

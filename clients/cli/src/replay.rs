@@ -10,6 +10,7 @@ mod rate;
 mod report;
 mod results;
 mod step_times;
+mod stream;
 
 use std::{path::PathBuf, process::ExitCode, time::Instant};
 
@@ -18,12 +19,13 @@ use clap::{Args, ValueEnum};
 use lanemap_core::{Params, Preset};
 use lanemap_openlane::{DriveFolder, Drives};
 
-use frames::{Disturbance, FrameSource, PreparedFrame};
+use frames::{Disturbance, Fault, FrameSource, PreparedFrame};
 use mapper_run::MapperRun;
 use progress::Progress;
 use rate::{Pacer, Rate};
 use report::{DriveReport, ReplayReport};
 use results::ResultWriter;
+use stream::{ServerLink, StreamedDrive};
 
 /// What to replay, how, and where to.
 #[derive(Args, Debug)]
@@ -49,8 +51,11 @@ pub struct ReplayArgs {
     /// How fast: 1 is as recorded, 10 ten times faster, max as fast as frames are taken
     #[arg(long, value_name = "1|max", default_value = "max")]
     rate: Rate,
+    /// The server to stream to
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
+    server: String,
     /// Run the mapper in this process only; no server is needed
-    #[arg(long)]
+    #[arg(long, conflicts_with = "server")]
     local: bool,
     /// Folder for the online local map of every frame (3 to 50 m ahead, 10 m to each side, what was known at that
     /// frame), in OpenLane's result format under the drives' own folder and file names
@@ -84,16 +89,19 @@ impl From<PresetArg> for Preset {
 }
 
 /// Replays the drives one after the other. Frames that cannot be read or are not valid are left out, named on stderr and
-/// in the report, and make the exit code 1; the rest is replayed.
-pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+/// in the report, and make the exit code 1, as do frames that the server refuses and a map of the server that is not the
+/// one made here; the rest is replayed.
+#[tokio::main]
+pub async fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let drives = Drives::list(&args.drives, &args.only)
         .context("no drives to replay; --drives must name a folder of segment-* folders")?;
     anyhow::ensure!(!drives.is_empty(), "{}: holds no segment-* folder", args.drives.display());
+    let server = if args.local { None } else { Some(ServerLink::connect(&args.server).await?) };
     let progress = Progress::new(drives.iter().map(DriveFolder::len).sum());
     let started = Instant::now();
     let mut reports = Vec::new();
     for drive in &drives {
-        reports.push(replay_drive(args, drive, &progress)?);
+        reports.push(replay_drive(args, drive, server.as_ref(), &progress).await?);
     }
     progress.finish();
     let report = ReplayReport::new(reports, started.elapsed());
@@ -105,20 +113,73 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     Ok(if report.is_whole() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-fn replay_drive(args: &ReplayArgs, drive: &DriveFolder, progress: &Progress) -> anyhow::Result<DriveReport> {
+async fn replay_drive(
+    args: &ReplayArgs,
+    drive: &DriveFolder,
+    server: Option<&ServerLink>,
+    progress: &Progress,
+) -> anyhow::Result<DriveReport> {
     let disturbance = Disturbance { pose_noise: args.pose_noise, drop: args.drop, seed: args.seed };
     let mut source = FrameSource::new(drive, disturbance, args.origin);
-    let mut pacer = Pacer::new(args.rate);
     let results = args.results_dir.as_ref().map(|root| ResultWriter::new(root, drive.name()));
-    let mut run: Option<MapperRun> = None;
-    for PreparedFrame { frame, annotation } in source.by_ref() {
-        let mapper = run.get_or_insert_with(|| MapperRun::new(Params::preset(args.preset.into()), annotation.sensor()));
-        pacer.wait_for(frame.time());
-        mapper.step(&frame, &annotation);
-        if let Some(results) = &results {
-            results.write(frame.time(), &annotation, mapper.mapper())?;
-        }
-        progress.stepped(mapper.lanes(), 0);
+    let mut pacer = Pacer::new(args.rate);
+    let mut run: Option<DriveRun<'_>> = None;
+    for prepared in source.by_ref() {
+        let run = match &mut run {
+            Some(run) => run,
+            None => run.insert(DriveRun::start(args.preset, drive.name(), &prepared, server).await?),
+        };
+        let due = pacer.wait_for(prepared.frame.time()).await;
+        run.take(&prepared, results.as_ref()).await?;
+        progress.stepped(run.mapper.lanes(), run.unacked, due.elapsed());
     }
-    Ok(DriveReport::new(drive.name(), run.as_ref(), source.into_faults()))
+    let faults = source.into_faults();
+    match run {
+        Some(run) => run.finish(drive.name(), faults).await,
+        None => Ok(DriveReport::new(drive.name(), None, faults, None)),
+    }
+}
+
+/// One drive on its way: into the mapper of this process, and to the server where there is one.
+struct DriveRun<'a> {
+    mapper: MapperRun,
+    stream: Option<StreamedDrive<'a>>,
+    unacked: u64,
+}
+
+impl<'a> DriveRun<'a> {
+    async fn start(
+        preset: PresetArg,
+        name: &str,
+        first: &PreparedFrame,
+        server: Option<&'a ServerLink>,
+    ) -> anyhow::Result<Self> {
+        let sensor = first.annotation.sensor();
+        let stream = match server {
+            Some(link) => Some(link.open(name, preset.into(), sensor).await?),
+            None => None,
+        };
+        Ok(Self { mapper: MapperRun::new(Params::preset(preset.into()), sensor), stream, unacked: 0 })
+    }
+
+    async fn take(&mut self, prepared: &PreparedFrame, results: Option<&ResultWriter<'_>>) -> anyhow::Result<()> {
+        let PreparedFrame { frame, annotation } = prepared;
+        if let Some(stream) = &mut self.stream {
+            stream.send(frame).await?;
+            self.unacked = stream.unacked_at(frame);
+        }
+        self.mapper.step(frame, annotation);
+        match results {
+            Some(results) => results.write(frame.time(), annotation, self.mapper.mapper()),
+            None => Ok(()),
+        }
+    }
+
+    async fn finish(self, name: &str, faults: Vec<Fault>) -> anyhow::Result<DriveReport> {
+        let session = match self.stream {
+            Some(stream) => Some(stream.finish(&self.mapper.mapper().lane_map()).await?),
+            None => None,
+        };
+        Ok(DriveReport::new(name, Some(&self.mapper), faults, session))
+    }
 }

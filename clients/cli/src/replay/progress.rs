@@ -20,10 +20,10 @@ impl Progress {
         Self { bar }
     }
 
-    /// One frame more; `lag` is the number of frames that are due and not yet in the map.
-    pub fn stepped(&self, lanes: usize, lag: usize) {
+    /// One frame more: `unacked` frames are sent and not durable yet, and this one was done `late` after it was due.
+    pub fn stepped(&self, lanes: usize, unacked: u64, late: Duration) {
         self.bar.inc(1);
-        self.bar.set_message(format!("{lanes} lanes, lag {lag} frames"));
+        self.bar.set_message(format!("{lanes} lanes, lag {} ms and {unacked} frames", late.as_millis()));
     }
 
     /// Takes the bar away.

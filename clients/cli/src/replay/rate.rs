@@ -51,11 +51,11 @@ impl Pacer {
         began.checked_add(after)
     }
 
-    /// Sleeps until the frame of a time is due.
-    pub fn wait_for(&mut self, time: TimestampNs) {
-        if let Some(due) = self.due(time) {
-            std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        }
+    /// Waits until the frame of a time is due, and says when that was.
+    pub async fn wait_for(&mut self, time: TimestampNs) -> Instant {
+        let Some(due) = self.due(time) else { return Instant::now() };
+        tokio::time::sleep_until(due.into()).await;
+        due
     }
 }
 

@@ -8,6 +8,7 @@ use super::{
     frames::Fault,
     mapper_run::MapperRun,
     step_times::{StepFigures, StepTimes},
+    stream::SessionReport,
 };
 
 /// Everything that was replayed.
@@ -40,13 +41,16 @@ pub struct DriveReport {
     pub step_us_per_km: Vec<Option<f64>>,
     /// Frames left out, and why.
     pub left_out: Vec<Fault>,
+    /// What became of it at the server; absent with `--local`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub session: Option<SessionReport>,
     #[serde(skip)]
     times: StepTimes,
 }
 
 impl DriveReport {
     /// The report of a drive; `run` is `None` where no frame of it could be replayed.
-    pub fn new(name: &str, run: Option<&MapperRun>, left_out: Vec<Fault>) -> Self {
+    pub fn new(name: &str, run: Option<&MapperRun>, left_out: Vec<Fault>, session: Option<SessionReport>) -> Self {
         let times = run.map(|run| run.times().clone()).unwrap_or_default();
         Self {
             name: name.to_owned(),
@@ -56,8 +60,15 @@ impl DriveReport {
             step_us: StepTimes::figures([&times]),
             step_us_per_km: times.means_per_km_us(),
             left_out,
+            session,
             times,
         }
+    }
+
+    /// Whether every frame was replayed, taken by the server, and mapped there as here.
+    fn is_whole(&self) -> bool {
+        let served = self.session.as_ref().is_none_or(|session| session.refused == 0 && session.same_as_local);
+        self.left_out.is_empty() && served
     }
 }
 
@@ -74,7 +85,7 @@ impl ReplayReport {
 
     /// Whether nothing was left out.
     pub fn is_whole(&self) -> bool {
-        self.frames > 0 && self.drives.iter().all(|drive| drive.left_out.is_empty())
+        self.frames > 0 && self.drives.iter().all(DriveReport::is_whole)
     }
 }
 
@@ -84,6 +95,14 @@ impl fmt::Display for ReplayReport {
         for drive in &self.drives {
             let DriveReport { name, frames, length_m, lanes, left_out, .. } = drive;
             writeln!(out, "{name:<34} {frames:>7} {length_m:>9.1} {lanes:>6} {:>9}", left_out.len())?;
+            if let Some(session) = &drive.session {
+                write!(out, "  {}", session.lanes_url)?;
+                match (session.refused, session.same_as_local) {
+                    (0, true) => writeln!(out)?,
+                    (0, false) => writeln!(out, "  NOT the map that the same frames make here")?,
+                    (refused, _) => writeln!(out, "  {refused} frames refused")?,
+                }
+            }
         }
         write!(out, "{} frames in {:.2} s", self.frames, self.seconds)?;
         if let Some(step) = &self.step_us {

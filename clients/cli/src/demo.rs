@@ -1,0 +1,78 @@
+//! `lanemap demo`: the service with a simulated fleet, until a signal ends it.
+
+mod fleet;
+
+use std::{net::SocketAddr, path::PathBuf, process::ExitCode, time::Duration};
+
+use anyhow::Context;
+use clap::Args;
+use lanemap_client::IngestClient;
+use lanemap_core::{
+    Pose,
+    geometry::georeference::{Anchor, Georeference, Wgs84},
+};
+use lanemap_server::{ConfigOverrides, Server, ServerConfig};
+use lanemap_simulator::{Scenario, road::NetworkPlan};
+
+use crate::signal;
+
+/// Where the simulated town lies: Turin, whose streets are a grid as well.
+const TURIN: Wgs84 = Wgs84 { latitude_deg: 45.0628, longitude_deg: 7.6688, height_m: 239.0 };
+/// Length of one drive, metres.
+const DRIVE_M: f64 = 4_000.0;
+/// Time that vehicles get to end their streams before the server does.
+const FLEET_GRACE: Duration = Duration::from_secs(3);
+
+/// The service with a simulated fleet.
+#[derive(Args, Debug)]
+pub struct DemoArgs {
+    /// Address and port for gRPC and HTTP; port 0 takes any free one
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
+    listen: SocketAddr,
+    /// Folder of the embedded store; made where it does not exist
+    #[arg(long, value_name = "DIR", default_value = "lanemap-data")]
+    data_dir: PathBuf,
+    /// Number of vehicles
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    vehicles: u32,
+    /// Seed of the town and its drives
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+}
+
+/// Serves and drives until SIGINT or SIGTERM.
+#[tokio::main]
+pub async fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
+    let overrides = ConfigOverrides {
+        listen: Some(args.listen),
+        data_dir: Some(args.data_dir.clone()),
+        ..ConfigOverrides::default()
+    };
+    let settings = ServerConfig::load(None, overrides).context("the settings cannot be used")?;
+    let stop = signal::stop_signals()?;
+    let server = Server::start(settings)
+        .await
+        .context("the demo does not start; --listen and --data-dir choose another address and another folder")?;
+    let client = IngestClient::connect(server.url()).await.context("the demo's own server cannot be reached")?;
+    let fleet = fleet::Fleet::start(args.vehicles, town(args.seed), turin(), &client);
+    let url = server.url();
+    println!("viewer  {url}/viewer\nlanes   {url}/collections/lanes/items\ngRPC    {url}");
+    println!("{} vehicles are driving; Ctrl-C stops", args.vehicles);
+    stop.await;
+    fleet.stop(FLEET_GRACE).await;
+    server.shutdown().await;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn town(seed: u64) -> Scenario {
+    Scenario {
+        network: NetworkPlan::Grid { columns: 5, rows: 5, spacing_m: 420.0 },
+        length_m: DRIVE_M,
+        drives: 0,
+        ..Scenario::town(seed)
+    }
+}
+
+fn turin() -> Georeference {
+    Georeference { anchor: Anchor::new(TURIN), enu_from_map: Pose::identity() }
+}

@@ -1,0 +1,147 @@
+//! `lanemap serve`: the service, until a signal ends it.
+
+use std::{net::SocketAddr, path::PathBuf, process::ExitCode};
+
+use anyhow::Context;
+use clap::Args;
+use lanemap_server::{ConfigOverrides, Server, ServerConfig};
+
+use crate::signal;
+
+/// Settings of the service: a flag wins over its LANEMAP_ variable, that over the file of --config, that over the
+/// default.
+#[derive(Args, Debug)]
+#[expect(clippy::doc_markdown, reason = "the comments are the text of --help")]
+pub struct ServeArgs {
+    /// YAML file of settings, named as the flags are, with _ for -; a name that is no setting is refused
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Address and port for gRPC and HTTP; port 0 takes any free one [env: LANEMAP_LISTEN] [default: 127.0.0.1:8080]
+    #[arg(long, value_name = "ADDRESS")]
+    listen: Option<SocketAddr>,
+    /// Folder of the embedded store; made where it does not exist [env: LANEMAP_DATA_DIR] [default: lanemap-data]
+    #[arg(long, value_name = "DIR")]
+    data_dir: Option<PathBuf>,
+    /// Largest gRPC message, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
+    #[arg(long, value_name = "BYTES")]
+    max_message_bytes: Option<usize>,
+    /// Most detections in a frame [env: LANEMAP_MAX_DETECTIONS] [default: 64]
+    #[arg(long, value_name = "N")]
+    max_detections: Option<usize>,
+    /// Most points in one detection [env: LANEMAP_MAX_POINTS_PER_DETECTION] [default: 4096]
+    #[arg(long, value_name = "N")]
+    max_points_per_detection: Option<usize>,
+    /// Farthest point from the vehicle, metres, on each axis [env: LANEMAP_MAX_POINT_RANGE_M] [default: 500.0]
+    #[arg(long, value_name = "M")]
+    max_point_range_m: Option<f64>,
+    /// Farthest odometry position from the origin of its frame, metres, on each axis
+    /// [env: LANEMAP_MAX_ODOMETRY_RANGE_M] [default: 10000000.0]
+    #[arg(long, value_name = "M")]
+    max_odometry_range_m: Option<f64>,
+    /// Most drives that the store holds [env: LANEMAP_MAX_SESSIONS] [default: 100000]
+    #[arg(long, value_name = "N")]
+    max_sessions: Option<usize>,
+    /// Most streams of vehicles at a time [env: LANEMAP_MAX_LIVE_SESSIONS] [default: 4096]
+    #[arg(long, value_name = "N")]
+    max_live_sessions: Option<usize>,
+    /// Most connections at a time; more wait to be accepted [env: LANEMAP_MAX_CONNECTIONS] [default: 8192]
+    #[arg(long, value_name = "N")]
+    max_connections: Option<usize>,
+    /// Frames of one session between the network and the journal; a faster vehicle waits
+    /// [env: LANEMAP_MAX_FRAMES_IN_FLIGHT] [default: 64]
+    #[arg(long, value_name = "N")]
+    max_frames_in_flight: Option<usize>,
+    /// Most frames of all sessions made durable together [env: LANEMAP_MAX_FRAMES_PER_COMMIT] [default: 2048]
+    #[arg(long, value_name = "N")]
+    max_frames_per_commit: Option<usize>,
+    /// Frames of a session after which its mapper's state is saved and its journal trimmed
+    /// [env: LANEMAP_SNAPSHOT_EVERY_FRAMES] [default: 1000]
+    #[arg(long, value_name = "N")]
+    snapshot_every_frames: Option<u64>,
+    /// Least time between two publications of one session's map, milliseconds
+    /// [env: LANEMAP_PUBLISH_INTERVAL_MS] [default: 150]
+    #[arg(long, value_name = "MS")]
+    publish_interval_ms: Option<u64>,
+    /// Time after which a session without a stream leaves memory (its map stays readable), seconds
+    /// [env: LANEMAP_UNLOAD_AFTER_S] [default: 60]
+    #[arg(long, value_name = "S")]
+    unload_after_s: Option<u64>,
+    /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]
+    #[arg(long, value_name = "S")]
+    keep_alive_s: Option<u64>,
+    /// Time that a shutdown gives open streams and connections to end, seconds
+    /// [env: LANEMAP_SHUTDOWN_GRACE_S] [default: 8]
+    #[arg(long, value_name = "S")]
+    shutdown_grace_s: Option<u64>,
+}
+
+impl ServeArgs {
+    fn overrides(&self) -> ConfigOverrides {
+        ConfigOverrides {
+            listen: self.listen,
+            data_dir: self.data_dir.clone(),
+            max_message_bytes: self.max_message_bytes,
+            max_detections: self.max_detections,
+            max_points_per_detection: self.max_points_per_detection,
+            max_point_range_m: self.max_point_range_m,
+            max_odometry_range_m: self.max_odometry_range_m,
+            max_sessions: self.max_sessions,
+            max_live_sessions: self.max_live_sessions,
+            max_connections: self.max_connections,
+            max_frames_in_flight: self.max_frames_in_flight,
+            max_frames_per_commit: self.max_frames_per_commit,
+            snapshot_every_frames: self.snapshot_every_frames,
+            publish_interval_ms: self.publish_interval_ms,
+            unload_after_s: self.unload_after_s,
+            keep_alive_s: self.keep_alive_s,
+            shutdown_grace_s: self.shutdown_grace_s,
+        }
+    }
+}
+
+/// Serves until SIGINT or SIGTERM.
+#[tokio::main]
+pub async fn run(args: &ServeArgs) -> anyhow::Result<ExitCode> {
+    let settings = ServerConfig::load(args.config.as_deref(), args.overrides())
+        .context("the settings cannot be used; lanemap serve --help lists them all")?;
+    let stop = signal::stop_signals()?;
+    let server = Server::start(settings).await.context("the service does not start")?;
+    println!("serving gRPC and HTTP on {url}, viewer at {url}/viewer", url = server.url());
+    stop.await;
+    server.shutdown().await;
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Only {
+        #[command(flatten)]
+        args: ServeArgs,
+    }
+
+    #[test]
+    fn every_setting_is_a_flag_whose_help_states_its_variable_and_true_default() {
+        let command = <Only as clap::CommandFactory>::command();
+        let defaults = serde_json::to_value(ServerConfig::default()).unwrap();
+        for (name, default) in defaults.as_object().unwrap() {
+            let flag = name.replace('_', "-");
+            let argument = command.get_arguments().find(|argument| argument.get_long() == Some(flag.as_str()));
+            let help = argument.unwrap_or_else(|| panic!("no flag for {name}")).get_help().unwrap().to_string();
+            let default = default.as_str().map_or_else(|| default.to_string(), str::to_owned);
+            assert!(help.contains(&format!("[default: {default}]")), "{name}: {help} lacks {default}");
+            assert!(help.contains(&format!("[env: LANEMAP_{}]", name.to_uppercase())), "{name}: {help}");
+        }
+    }
+
+    #[test]
+    fn a_flag_reaches_the_settings() {
+        let only = Only::parse_from(["serve", "--keep-alive-s", "7", "--listen", "127.0.0.1:0"]);
+        let settings = ServerConfig::load(None, only.args.overrides()).unwrap();
+        assert_eq!(settings.keep_alive_s, 7);
+        assert_eq!(settings.listen.port(), 0);
+    }
+}

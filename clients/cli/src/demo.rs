@@ -54,7 +54,7 @@ pub async fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
         .await
         .context("the demo does not start; --listen and --data-dir choose another address and another folder")?;
     let client = IngestClient::connect(server.url()).await.context("the demo's own server cannot be reached")?;
-    let fleet = fleet::Fleet::start(args.vehicles, town(args.seed), turin(), &client);
+    let fleet = fleet::Fleet::start(args.vehicles, &town(args.seed), turin(), &client);
     let url = server.url();
     println!("viewer  {url}/viewer\nlanes   {url}/collections/lanes/items\ngRPC    {url}");
     println!("{} vehicles are driving; Ctrl-C stops", args.vehicles);

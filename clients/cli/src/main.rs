@@ -1,13 +1,14 @@
-//! The `lanemap` command: serve, replay, simulate, demo.
+//! The `lanemap` command: serve, replay, evaluate, simulate, demo.
 //!
 //! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
 //! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
 
-use std::process::ExitCode;
+use std::{io::IsTerminal, process::ExitCode};
 
 use clap::{Parser, Subcommand};
 
 mod demo;
+mod evaluate;
 mod replay;
 mod serve;
 mod signal;
@@ -27,6 +28,8 @@ enum Command {
     Serve(Box<serve::ServeArgs>),
     /// Replays recorded drives (OpenLane folders) into a server, or into a mapper in this process.
     Replay(Box<replay::ReplayArgs>),
+    /// Measures maps, poses and associations as the paper's tables do.
+    Evaluate(evaluate::EvaluateArgs),
     /// Serves, with a simulated fleet driving through a town: something to look at.
     Demo(demo::DemoArgs),
     /// Makes synthetic drives with their truth, as OpenLane folders.
@@ -39,6 +42,7 @@ fn main() -> ExitCode {
     let done = match cli.command {
         Command::Serve(args) => serve::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };
@@ -51,9 +55,13 @@ fn main() -> ExitCode {
     }
 }
 
-/// Logs at `info`, or as `RUST_LOG` says.
+/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business.
+const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn";
+
+/// Logs to stderr, in colour where that is a terminal.
 fn log_to_stderr() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(DEFAULT_LOG));
+    let colour = std::io::stderr().is_terminal();
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colour).with_writer(std::io::stderr).init();
 }

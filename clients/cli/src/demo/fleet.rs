@@ -42,10 +42,10 @@ struct Town {
 
 impl Fleet {
     /// Lets so many vehicles drive, each on a connection of its own session.
-    pub fn start(vehicles: u32, scenario: Scenario, on_earth: Georeference, client: &IngestClient) -> Self {
+    pub fn start(vehicles: u32, scenario: &Scenario, on_earth: Georeference, client: &IngestClient) -> Self {
         let network = RoadNetwork::build(&scenario.network, scenario.max_grade, scenario.seed);
         let began_unix_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-        let town = Arc::new(Town { scenario, network, on_earth, began_unix_s });
+        let town = Arc::new(Town { scenario: *scenario, network, on_earth, began_unix_s });
         let (tasks, stop) = (TaskTracker::new(), CancellationToken::new());
         for vehicle in 0..vehicles {
             let drives = (vehicle..).step_by(vehicles as usize);

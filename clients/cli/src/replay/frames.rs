@@ -106,7 +106,9 @@ impl<'a> FrameSource<'a> {
                 let motion = [Pose::identity(), last_truth.inverse() * truth];
                 let noisy =
                     noisy_odometry(&motion, noise.yaw_sigma_deg, noise.translation_sigma_m, &mut self.noise_rng);
-                last_odometry * noisy[1]
+                let mut moved = last_odometry * noisy[1];
+                moved.rotation.renormalize();
+                moved
             }
             None => truth,
         };

@@ -13,7 +13,7 @@ def measure(n, radius=300.0):  # put your sensors here: this vehicle follows a b
     for r in (radius + 1.75, radius - 1.75):
         xyz = [c for s in range(5, 50, 3) for c in (r * sin(s / radius), radius - r * cos(s / radius), 0.0)]
         lines.append(obs.Detection(category=obs.LANE_CATEGORY_WHITE_SOLID, xyz=xyz))
-    place = geo.GeodeticPosition(latitude_deg=48.1 + degrees(north / 6.37e6), longitude_deg=11.6 + degrees(east / 4.26e6))
+    place = geo.GeodeticPosition(latitude_deg=48.1 + degrees(north / 6.37e6), longitude_deg=11.6 + degrees(east / 4.27e6))
     return lines, pose(east, north, 0, turn), obs.GnssFix(position=place, horizontal_sigma_m=1, vertical_sigma_m=2, yaw_enu_rad=turn)
 
 def drive(start_ns=time.time_ns()):

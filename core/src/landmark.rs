@@ -8,5 +8,6 @@ pub mod growth;
 pub mod index;
 pub mod information;
 pub mod lane;
+pub mod line_terms;
 
 pub use lane::Landmark;

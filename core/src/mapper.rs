@@ -21,7 +21,7 @@ use crate::{
         Pose, TangentCovariance,
         georeference::{Georeference, GeoreferenceFit},
     },
-    landmark::{Landmark, duplicate, index::LaneIndex, lane::map_samples},
+    landmark::{Landmark, duplicate, index::LaneIndex},
     lane_map::{LaneId, LaneMap, LocalLane, LocalWindow},
     observation::{LaneObservation, observe},
     params::{Params, Preset},
@@ -211,7 +211,7 @@ impl Mapper {
     fn begin_lane(&mut self, observation: &LaneObservation, time: TimestampNs) -> Option<LaneId> {
         let id = LaneId(self.last_lane + 1);
         let pose = &self.pose.map_from_vehicle;
-        let mut lane = Landmark::begin(id, observation, pose, time, &self.params.landmark)?;
+        let mut lane = Landmark::begin(id, observation, pose, time, &self.params)?;
         self.last_lane += 1;
         Self::take_in(&mut lane, observation, time, pose, &self.sensor, &self.params);
         let (first, last) = lane.knots();
@@ -230,12 +230,11 @@ impl Mapper {
         sensor: &Sensor,
         params: &Params,
     ) {
-        let camera = Point3::from(sensor.ground_offset());
         let near = scene::near_knots(lane, map_from_vehicle, observation);
-        lane.smooth(map_samples(observation, map_from_vehicle, &camera, &params.landmark), near, &params.landmark);
-        let visibility = |point: &Point3<f64>| {
-            scene::visibility(&map_from_vehicle.inverse_transform_point(point), sensor, &params.observation)
-        };
+        let seconds = time.seconds_since(lane.last_seen);
+        lane.smooth(observation, map_from_vehicle, seconds, near, params);
+        let visibility =
+            |point: &Point3<f64>| scene::visibility(&map_from_vehicle.inverse_transform_point(point), sensor, params);
         lane.vote_extent(observation, map_from_vehicle, near, visibility, &params.landmark);
         lane.category.vote(observation.category);
         lane.existence.seen(0.85);
@@ -254,7 +253,8 @@ impl Mapper {
                 continue;
             }
             let Some(lane) = self.lanes.get_mut(&run.lane) else { continue };
-            let chance = scene::detection_probability(lane, run, &self.pose.map_from_vehicle, &self.sensor, &self.params);
+            let chance =
+                scene::detection_probability(lane, run, &self.pose.map_from_vehicle, &self.sensor, &self.params);
             lane.existence.missed(chance);
             if lane.existence.probability() < 0.05 {
                 dropped.push(run.lane);

@@ -45,6 +45,8 @@ pub struct LaneObservation {
     ///
     /// A detector that reports a line at fixed rows reports it from the row before its visible part to the row after.
     pub certain: (f64, f64),
+    /// Points that were measured and entered the fit.
+    pub measured: usize,
     /// Samples along the line from `reported.0` to `reported.1`.
     pub samples: Vec<ObservedPoint>,
 }
@@ -109,6 +111,7 @@ pub fn observe(
         vertical: fit.vertical,
         reported,
         certain,
+        measured: points.len(),
         samples: Vec::new(),
     };
     observation.samples = resample(&observation, params, range_m);

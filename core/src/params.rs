@@ -27,6 +27,27 @@ pub struct Params {
     pub tracking: TrackingParams,
     /// Growth and smoothing of a lane.
     pub landmark: LandmarkParams,
+    /// The detector's own error along a line.
+    pub line_error: LineErrorParams,
+}
+
+/// Parameters of [`crate::landmark::line_terms`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LineErrorParams {
+    /// Whether samples of a line are taken for correlated (`default`).
+    pub enabled: bool,
+    /// Range at which the sigmas are quoted, metres.
+    pub reference_range_m: f64,
+    /// Standard deviation of the constant, linear and quadratic part of a line's error at the reference range, metres.
+    pub sigmas_m: [f64; 3],
+    /// Time over which the error is correlated, seconds.
+    pub correlation_s: f64,
+    /// White noise of a sample, metres.
+    pub white_sigma_m: f64,
+    /// Distance of two samples, metres along the line.
+    pub step_m: f64,
+    /// Huber threshold of a whole line in one frame, in sigmas.
+    pub huber_sigmas: f64,
 }
 
 /// Standard deviation of a detection: `near + growth * (range / reference_range)^exponent`.
@@ -162,12 +183,22 @@ pub struct LandmarkParams {
     pub huber_m: f64,
     /// Frames whose weights and foot points are evaluated anew before they are folded for good.
     pub window_frames: usize,
-    /// Every n-th sample enters the map.
-    pub sample_stride: usize,
     /// Lanes seen in fewer frames than this are not shown.
     pub least_observations: u32,
     /// Noise of a detection, as it weighs in the map.
     pub noise: RangeNoise,
+    /// A stretch of line is drawn where this share of its votes saw it.
+    pub drawn_share: f64,
+    /// Detections are sure up to this range, metres: a stretch nearer than this that is not reported is not there.
+    pub sure_range_m: f64,
+    /// From this range on a detector may report nothing, metres.
+    pub blind_range_m: f64,
+    /// Lanes are shown from this probability of existence on.
+    pub shown_existence: f64,
+    /// A lane that this frame missed is shown in the local map if this much of it lies in the image, metres.
+    pub shown_in_image_m: f64,
+    /// A lane is shown in the local map if this much of it lies in the window, metres.
+    pub shown_in_window_m: f64,
 }
 
 impl Params {
@@ -217,10 +248,16 @@ impl Params {
                 witnesses: f64::INFINITY,
                 huber_m: 0.5,
                 window_frames: 0,
-                sample_stride: 1,
                 least_observations: 4,
                 noise,
+                drawn_share: 0.0,
+                sure_range_m: 50.0,
+                blind_range_m: 51.0,
+                shown_existence: 0.0,
+                shown_in_image_m: 0.0,
+                shown_in_window_m: 0.0,
             },
+            line_error: LineErrorParams { enabled: false, step_m: 0.5, ..Self::mended().line_error },
         }
     }
 
@@ -286,9 +323,23 @@ impl Params {
                 witnesses: 1.0,
                 huber_m: 0.8,
                 window_frames: 3,
-                sample_stride: 3,
                 least_observations: 3,
                 noise,
+                drawn_share: 0.5,
+                sure_range_m: 20.0,
+                blind_range_m: 45.0,
+                shown_existence: 0.6,
+                shown_in_image_m: 8.0,
+                shown_in_window_m: 5.0,
+            },
+            line_error: LineErrorParams {
+                enabled: true,
+                reference_range_m: 50.0,
+                sigmas_m: [0.08, 0.25, 0.4],
+                correlation_s: 0.5,
+                white_sigma_m: 0.1,
+                step_m: 3.0,
+                huber_sigmas: 2.0,
             },
         }
     }

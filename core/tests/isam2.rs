@@ -85,9 +85,9 @@ fn golden_frames() -> Vec<GoldenFrame> {
 }
 
 /// The lane after each frame, beside what iSAM2 made of it.
-fn replay(mut compare: impl FnMut(&BandedInformation, &GoldenFrame)) {
+fn replay(mut compare: impl FnMut(&BandedInformation<4>, &GoldenFrame)) {
     let frames = golden_frames();
-    let mut lane = BandedInformation::new(Point3::from(frames[0].born[0].initial));
+    let mut lane = BandedInformation::<4>::new(Point3::from(frames[0].born[0].initial));
     for frame in &frames {
         for born in &frame.born {
             if born.index < lane.head() {

@@ -5,7 +5,7 @@
 //! shows one *or* the other: frames that show one alone speak for it, frames that show both speak against it. The younger
 //! lane's information is added to the older one; nothing is deleted.
 
-use super::{information::Knot, lane::FootWalk, Landmark};
+use super::{Landmark, information::Knot, lane::FootWalk};
 use crate::{lane_map::LaneId, params::LandmarkParams};
 
 /// Frames that must speak for a duplicate, net of those against.

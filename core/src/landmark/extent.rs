@@ -29,8 +29,8 @@ struct Stretch {
 }
 
 impl Stretch {
-    fn is_drawn(self) -> bool {
-        self.seen > self.absent
+    fn is_drawn(self, share: f64) -> bool {
+        f64::from(self.seen) > share * f64::from(self.seen + self.absent)
     }
 }
 
@@ -116,11 +116,11 @@ impl Extent {
         }
     }
 
-    /// First and last parameter of the line, by knot; `None` where no stretch has a majority.
+    /// First and last parameter of the line, by knot: the outermost stretches that more than `share` of their votes saw.
     #[must_use]
-    pub fn drawn(&self) -> Option<(f64, f64)> {
-        let first = self.stretches.iter().position(|stretch| stretch.is_drawn())?;
-        let last = self.stretches.iter().rposition(|stretch| stretch.is_drawn())?;
+    pub fn drawn(&self, share: f64) -> Option<(f64, f64)> {
+        let first = self.stretches.iter().position(|stretch| stretch.is_drawn(share))?;
+        let last = self.stretches.iter().rposition(|stretch| stretch.is_drawn(share))?;
         let border = |index: usize| (self.first as f64 + index as f64) / PER_KNOT;
         Some((border(first), border(last + 1)))
     }
@@ -143,7 +143,7 @@ mod tests {
                 let sighting = Sighting { reported: (0.0, rows_to_end + spacing), certain: (0.0, rows_to_end) };
                 extent.vote(&sighting, 0.0, 20.0, |_| 1.0);
             }
-            let (_, to) = extent.drawn().unwrap();
+            let (_, to) = extent.drawn(0.5).unwrap();
             prop_assert!((to - end).abs() < 0.4, "{to}");
         }
     }
@@ -155,6 +155,6 @@ mod tests {
         for _ in 0..20 {
             extent.vote(&Sighting { reported: (0.0, 5.0), certain: (0.0, 5.0) }, 0.0, 12.0, |_| 0.0);
         }
-        assert_eq!(extent.drawn(), Some((0.0, 12.0)));
+        assert_eq!(extent.drawn(0.5), Some((0.0, 12.0)));
     }
 }

@@ -97,7 +97,13 @@ fn cell_of(coordinate: f64) -> i64 {
 
 impl LaneIndex {
     /// Brings the blocks of a lane up to date for its knots from `first` to `last`, those that a frame touched.
-    pub fn update(&mut self, lane: LaneId, information: &BandedInformation, first: Knot, last: Knot) {
+    pub fn update<const W: usize>(
+        &mut self,
+        lane: LaneId,
+        information: &BandedInformation<W>,
+        first: Knot,
+        last: Knot,
+    ) {
         for block in first.div_euclid(BLOCK)..=last.div_euclid(BLOCK) {
             let (first, points) = block_points(information, block);
             let key = (lane, block);
@@ -177,7 +183,7 @@ fn near_in_block(block: &Block, place: &Point3<f64>, radius_m: f64) -> Option<(K
 
 /// First knot and positions of the control points of one block.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_possible_wrap)] // clamped to the lane
-fn block_points(information: &BandedInformation, block: i64) -> (Knot, Vec<[f64; 3]>) {
+fn block_points<const W: usize>(information: &BandedInformation<W>, block: i64) -> (Knot, Vec<[f64; 3]>) {
     let head = information.head();
     let tail = head + information.len() as Knot - 1;
     let (first, last) = ((block * BLOCK).max(head), (block * BLOCK + BLOCK - 1).min(tail));
@@ -191,7 +197,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn straight(y: f64, count: i32) -> BandedInformation {
+    fn straight(y: f64, count: i32) -> BandedInformation<4> {
         let mut lane = BandedInformation::new(Point3::new(0.0, y, 0.0));
         (0..count).for_each(|k| lane.push_tail(Point3::new(3.0 * f64::from(k), y, 0.0)));
         lane

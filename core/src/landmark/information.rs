@@ -1,12 +1,15 @@
 //! Incremental smoothing: the banded information of a lane's control points and its solution.
 //!
-//! Paper: "Spline Optimization". Every term is `lambda |sum_k w_k P_{first + k} - q|^2` with four weights, so the normal
-//! equations `H X = B` have one scalar matrix `H` of half-bandwidth 3 for all three axes. iSAM2 on this chain is
-//! exactly: add the new terms, refactorise `H = L D L^T` from the first row they touch, substitute back until the
-//! change dies out. Where the authors call GTSAM, this file does that.
+//! Paper: "Spline Optimization". Every point-to-spline term is `lambda |sum_k w_k P_{first + k} - q|^2` with four weights, so
+//! the normal equations `H X = B` have one scalar matrix `H` of half-bandwidth 3 for all three axes. iSAM2 on this
+//! chain is exactly: add the new terms, refactorise `H = L D L^T` from the first row they touch, substitute back until
+//! the change dies out. Where the authors call GTSAM, this file does that.
+//!
+//! The width `W` (the half-bandwidth and one) is a constant: 4 suffices for the paper. Where the errors of one line in one frame are
+//! correlated (`landmark::line_terms`), one frame couples all control points in view, and `W` is their number.
 //!
 //! * Rows are numbered by [`Knot`]s, which may be negative: both ends grow in O(1) and no index ever shifts.
-//! * Refactorisation and substitution stop at three rows in succession that come out *bit for bit* as they were: all
+//! * Refactorisation and substitution stop at `W - 1` rows in succession that come out *bit for bit* as they were: all
 //!   later rows depend on these alone. So the factor and the solution are a pure function of the terms, whatever the
 //!   order of solving, and a restored lane goes on with the same bits.
 //! * Positions are kept relative to an anchor, so that a lane 10 km from the origin loses no digits.
@@ -22,8 +25,8 @@ use serde::{Deserialize, Serialize};
 /// Number of a control point in its lane: it never changes, and is negative for those grown at the head.
 pub type Knot = i64;
 
-/// Control points that one term may join.
-pub const WIDTH: usize = 4;
+/// Control points that a point-to-spline term joins.
+pub const SUPPORT: usize = 4;
 
 /// One quadratic term: `information * |sum_k weights[k] P_{first + k} - target|^2`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -31,23 +34,29 @@ pub struct Term {
     /// First control point.
     pub first: Knot,
     /// Weights of `first .. first + 4`; zero where there is no such control point.
-    pub weights: [f64; WIDTH],
+    pub weights: [f64; SUPPORT],
     /// Where the weighted sum should be: a position for weights that sum to 1, a difference for weights that sum to 0.
     pub target: Vector3<f64>,
     /// Inverse variance, 1/m^2.
     pub information: f64,
 }
 
-/// One row of the normal equations: the diagonal, three entries to its left, and the right-hand side.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Row {
-    /// `H[i][i - k]` for `k = 0 .. 4`.
-    band: [f64; WIDTH],
+/// One row of the normal equations: the diagonal, the entries to its left, and the right-hand side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Row<const W: usize> {
+    /// `H[i][i - k]` for `k = 0 .. W`.
+    band: [f64; W],
     /// `B[i]`, relative to the anchor.
     right: Vector3<f64>,
 }
 
-impl Row {
+impl<const W: usize> Default for Row<W> {
+    fn default() -> Self {
+        Self { band: [0.0; W], right: Vector3::zeros() }
+    }
+}
+
+impl<const W: usize> Row<W> {
     fn add(&mut self, other: &Self) {
         for (mine, theirs) in self.band.iter_mut().zip(other.band) {
             *mine += theirs;
@@ -56,22 +65,83 @@ impl Row {
     }
 }
 
-/// One row of the factor: `D[i]`, `L[i][i - 1 ..= i - 3]` and the forward substituted right-hand side.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct FactorRow {
+/// One row of the factor: `D[i]`, `L[i][i - k]` for `k = 1 .. W` (`left[0]` is unused) and the forward substituted side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct FactorRow<const W: usize> {
     pivot: f64,
-    left: [f64; WIDTH - 1],
+    left: [f64; W],
     forward: Vector3<f64>,
+}
+
+impl<const W: usize> Default for FactorRow<W> {
+    fn default() -> Self {
+        Self { pivot: 1.0, left: [0.0; W], forward: Vector3::zeros() }
+    }
+}
+
+/// A dense quadratic over a run of control points: `X^T H X / 2 - B^T X`, positions as they are.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct DenseTerm {
+    /// First control point.
+    pub first: Knot,
+    /// Number of control points.
+    pub count: usize,
+    /// `H`, `count x count`, by rows.
+    pub information: Vec<f64>,
+    /// `B`, one row per control point.
+    pub right: Vec<Vector3<f64>>,
 }
 
 /// Sums of terms over a run of control points, not yet solved.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct BandedSum {
+#[serde(from = "StoredSum", into = "StoredSum")]
+pub struct BandedSum<const W: usize> {
     first: Knot,
-    rows: VecDeque<Row>,
+    rows: VecDeque<Row<W>>,
 }
 
-impl BandedSum {
+/// What a snapshot keeps of a sum.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct StoredSum {
+    first: Knot,
+    rows: Vec<StoredRow>,
+}
+
+/// A row without its trailing zeros: behind the vehicle most of a wide band is empty.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct StoredRow {
+    band: Vec<f64>,
+    right: Vector3<f64>,
+}
+
+impl<const W: usize> From<Row<W>> for StoredRow {
+    fn from(row: Row<W>) -> Self {
+        let used = row.band.iter().rposition(|entry| *entry != 0.0).map_or(0, |last| last + 1);
+        Self { band: row.band[..used].to_vec(), right: row.right }
+    }
+}
+
+impl<const W: usize> From<StoredRow> for Row<W> {
+    fn from(stored: StoredRow) -> Self {
+        let mut row = Self { right: stored.right, ..Self::default() };
+        row.band.iter_mut().zip(stored.band).for_each(|(mine, theirs)| *mine = theirs);
+        row
+    }
+}
+
+impl<const W: usize> From<BandedSum<W>> for StoredSum {
+    fn from(sum: BandedSum<W>) -> Self {
+        Self { first: sum.first, rows: sum.rows.into_iter().map(StoredRow::from).collect() }
+    }
+}
+
+impl<const W: usize> From<StoredSum> for BandedSum<W> {
+    fn from(stored: StoredSum) -> Self {
+        Self { first: stored.first, rows: stored.rows.into_iter().map(Row::from).collect() }
+    }
+}
+
+impl<const W: usize> BandedSum<W> {
     /// First and last knot, or `None` while there is no term.
     #[must_use]
     #[allow(clippy::cast_possible_wrap)] // a count of control points
@@ -99,6 +169,24 @@ impl BandedSum {
         }
     }
 
+    /// Adds a dense term, with positions relative to `anchor`. Control points past the width are left out.
+    pub fn add_dense(&mut self, term: &DenseTerm, anchor: &Point3<f64>) {
+        let count = term.count.min(W);
+        if count == 0 {
+            return;
+        }
+        self.cover(term.first, count);
+        let start = self.offset(term.first);
+        for k in 0..count {
+            let entries = &term.information[k * term.count..k * term.count + count];
+            let row = &mut self.rows[start + k];
+            for back in 0..=k {
+                row.band[back] += entries[k - back];
+            }
+            row.right += term.right[k] - anchor.coords * entries.iter().sum::<f64>();
+        }
+    }
+
     /// Makes room for `count` knots from `first`.
     fn cover(&mut self, first: Knot, count: usize) {
         if self.rows.is_empty() {
@@ -120,7 +208,7 @@ impl BandedSum {
         (knot - self.first) as usize
     }
 
-    fn row(&self, knot: Knot) -> Option<&Row> {
+    fn row(&self, knot: Knot) -> Option<&Row<W>> {
         usize::try_from(knot - self.first).ok().and_then(|index| self.rows.get(index))
     }
 
@@ -140,11 +228,11 @@ impl BandedSum {
 /// The information of a lane's control points, its factor and its solution.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(from = "Stored", into = "Stored")]
-pub struct BandedInformation {
+pub struct BandedInformation<const W: usize> {
     anchor: Point3<f64>,
     head: Knot,
-    rows: VecDeque<Row>,
-    factor: VecDeque<FactorRow>,
+    rows: VecDeque<Row<W>>,
+    factor: VecDeque<FactorRow<W>>,
     offsets: VecDeque<Vector3<f64>>,
     positions: VecDeque<Point3<f64>>,
     /// Rows changed since the last solution: first and last index.
@@ -156,20 +244,21 @@ pub struct BandedInformation {
 struct Stored {
     anchor: Point3<f64>,
     head: Knot,
-    rows: VecDeque<Row>,
+    rows: Vec<StoredRow>,
     offsets: VecDeque<Vector3<f64>>,
 }
 
-impl From<BandedInformation> for Stored {
-    fn from(information: BandedInformation) -> Self {
+impl<const W: usize> From<BandedInformation<W>> for Stored {
+    fn from(information: BandedInformation<W>) -> Self {
         let BandedInformation { anchor, head, rows, offsets, .. } = information;
-        Self { anchor, head, rows, offsets }
+        Self { anchor, head, rows: rows.into_iter().map(StoredRow::from).collect(), offsets }
     }
 }
 
-impl From<Stored> for BandedInformation {
+impl<const W: usize> From<Stored> for BandedInformation<W> {
     fn from(stored: Stored) -> Self {
         let Stored { anchor, head, rows, offsets } = stored;
+        let rows: VecDeque<Row<W>> = rows.into_iter().map(Row::from).collect();
         let positions = offsets.iter().map(|offset| anchor + offset).collect();
         let factor = std::iter::repeat_n(FactorRow::default(), rows.len()).collect();
         let mut information = Self { anchor, head, rows, factor, offsets, positions, touched: None };
@@ -178,7 +267,7 @@ impl From<Stored> for BandedInformation {
     }
 }
 
-impl BandedInformation {
+impl<const W: usize> BandedInformation<W> {
     /// No control points yet; positions will be kept relative to `anchor`.
     #[must_use]
     pub fn new(anchor: Point3<f64>) -> Self {
@@ -261,13 +350,13 @@ impl BandedInformation {
 
     /// Adds one term for good.
     pub fn add(&mut self, term: &Term) {
-        let mut sum = BandedSum::default();
+        let mut sum = BandedSum::<W>::default();
         sum.add(term, &self.anchor);
         self.absorb(&sum);
     }
 
     /// Adds a sum of terms for good. Rows of control points that the lane does not have are left out.
-    pub fn absorb(&mut self, sum: &BandedSum) {
+    pub fn absorb(&mut self, sum: &BandedSum<W>) {
         for (k, row) in (sum.first..).zip(&sum.rows) {
             if let Some(index) = self.index(k) {
                 self.rows[index].add(row);
@@ -277,7 +366,7 @@ impl BandedInformation {
     }
 
     /// Puts the total of `sums`, added in their order, in place of the rows of `first ..= last`.
-    pub fn replace<'a>(&mut self, first: Knot, last: Knot, sums: impl Iterator<Item = &'a BandedSum> + Clone) {
+    pub fn replace<'a>(&mut self, first: Knot, last: Knot, sums: impl Iterator<Item = &'a BandedSum<W>> + Clone) {
         for knot in first..=last {
             let Some(index) = self.index(knot) else { continue };
             let mut row = Row::default();
@@ -307,27 +396,32 @@ impl BandedInformation {
             let row = self.factor_row(i);
             unchanged = if row == self.factor[i] { unchanged + 1 } else { 0 };
             self.factor[i] = row;
-            if i >= last + WIDTH - 1 && unchanged >= WIDTH - 1 {
+            if i >= last + W - 1 && unchanged >= W - 1 {
                 return i + 1;
             }
         }
         self.rows.len()
     }
 
-    /// Row `i` of the factor, from the three rows before it.
-    fn factor_row(&self, i: usize) -> FactorRow {
-        let Row { band, right } = self.rows[i];
-        let nothing = FactorRow { pivot: 1.0, ..FactorRow::default() };
-        let before = |back: usize| if i >= back { self.factor[i - back] } else { nothing };
-        let (one, two, three) = (before(1), before(2), before(3));
-        // Columns i-3, i-2, i-1 of row i, times their pivots.
-        let scaled_three = band[3];
-        let scaled_two = band[2] - scaled_three * two.left[0];
-        let scaled_one = band[1] - scaled_three * one.left[1] - scaled_two * one.left[0];
-        let left = [scaled_one / one.pivot, scaled_two / two.pivot, scaled_three / three.pivot];
-        let pivot = band[0] - left[0] * scaled_one - left[1] * scaled_two - left[2] * scaled_three;
-        let forward = right - one.forward * left[0] - two.forward * left[1] - three.forward * left[2];
-        FactorRow { pivot, left, forward }
+    /// Row `i` of the factor, from the `W - 1` rows before it.
+    fn factor_row(&self, i: usize) -> FactorRow<W> {
+        let Row { band, right } = &self.rows[i];
+        let reach = i.min(W - 1);
+        // `scaled[k]` is `L[i][i - k] D[i - k]`, column by column from the left.
+        let mut scaled = [0.0; W];
+        let mut row = FactorRow { pivot: band[0], left: [0.0; W], forward: *right };
+        for back in (1..=reach).rev() {
+            let before = &self.factor[i - back];
+            let mut entry = band[back];
+            for further in back + 1..=reach {
+                entry -= scaled[further] * before.left[further - back];
+            }
+            scaled[back] = entry;
+            row.left[back] = entry / before.pivot;
+            row.pivot -= row.left[back] * entry;
+            row.forward -= before.forward * row.left[back];
+        }
+        row
     }
 
     /// Substitutes back from `end` towards the head, until rows before `first` come out as they were.
@@ -335,15 +429,13 @@ impl BandedInformation {
         let mut unchanged = 0;
         for i in (0..end).rev() {
             let mut offset = self.factor[i].forward / self.factor[i].pivot;
-            for ahead in 1..WIDTH {
-                if let Some(row) = self.factor.get(i + ahead) {
-                    offset -= self.offsets[i + ahead] * row.left[ahead - 1];
-                }
+            for ahead in 1..W.min(self.rows.len() - i) {
+                offset -= self.offsets[i + ahead] * self.factor[i + ahead].left[ahead];
             }
             unchanged = if offset == self.offsets[i] { unchanged + 1 } else { 0 };
             self.offsets[i] = offset;
             self.positions[i] = self.anchor + offset;
-            if i + WIDTH <= first && unchanged >= WIDTH - 1 {
+            if i + W <= first && unchanged >= W - 1 {
                 return;
             }
         }
@@ -356,19 +448,20 @@ impl BandedInformation {
     pub fn variances(&self, from: usize) -> Vec<f64> {
         let count = self.rows.len();
         let mut variances = vec![0.0; count.saturating_sub(from)];
-        // Z[i][i .. i + 4] for the three rows after the current one.
-        let mut after: [[f64; WIDTH]; WIDTH - 1] = [[0.0; WIDTH]; WIDTH - 1];
+        // Z[i][i .. i + W] for the rows after the current one, nearest first.
+        let mut after: VecDeque<[f64; W]> = VecDeque::with_capacity(W);
         for i in (from..count).rev() {
-            let below = |ahead: usize| self.factor.get(i + ahead).map_or(0.0, |row| row.left[ahead - 1]);
-            let left = [below(1), below(2), below(3)];
-            let inverse = |a: usize, b: usize| after[a.min(b) - 1][a.abs_diff(b)];
-            let mut band = [0.0; WIDTH];
-            for ahead in 1..WIDTH {
-                band[ahead] = -(1..WIDTH).map(|m| left[m - 1] * inverse(ahead, m)).sum::<f64>();
+            let reach = after.len();
+            let below = |ahead: usize| self.factor[i + ahead].left[ahead];
+            let mut band = [0.0; W];
+            for ahead in 1..=reach {
+                let inverse = |m: usize| after[ahead.min(m) - 1][ahead.abs_diff(m)];
+                band[ahead] = -(1..=reach).map(|m| below(m) * inverse(m)).sum::<f64>();
             }
-            band[0] = 1.0 / self.factor[i].pivot - (1..WIDTH).map(|m| left[m - 1] * band[m]).sum::<f64>();
+            band[0] = 1.0 / self.factor[i].pivot - (1..=reach).map(|m| below(m) * band[m]).sum::<f64>();
             variances[i - from] = band[0];
-            after = [band, after[0], after[1]];
+            after.push_front(band);
+            after.truncate(W - 1);
         }
         variances
     }

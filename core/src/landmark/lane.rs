@@ -17,13 +17,14 @@ use super::{
     extent::{Extent, Sighting},
     growth::{self, GrowthRule},
     information::{BandedInformation, BandedSum, Knot, Term},
+    line_terms::{ControlPointAt, LineSample, PlacedSample, line_terms},
 };
 use crate::{
     frame::TimestampNs,
     geometry::Pose,
     lane_map::{EndRule, LaneId},
     observation::{LaneObservation, sigma_at},
-    params::LandmarkParams,
+    params::{LandmarkParams, Params},
     spline::{Curve, FootPoint, foot_point_coarse, foot_point_refined},
 };
 
@@ -49,49 +50,61 @@ pub struct Landmark {
     pub last_seen: TimestampNs,
     /// Another lane that may be the same, and how many frames spoke for it (negative: against).
     pub rival: Option<(LaneId, i32)>,
-    information: BandedInformation,
+    information: BandedInformation<WIDTH>,
     /// Terms that will not be evaluated again.
-    folded: BandedSum,
+    folded: BandedSum<WIDTH>,
     /// Terms of the last frames.
     recent: VecDeque<RecentFrame>,
     /// Knots whose rows are out of date.
     stale: Option<(Knot, Knot)>,
+    /// Samples of the last frame that saw the lane.
+    last_samples: Option<Vec<LineSample>>,
 }
 
 /// Samples of one frame that are still evaluated anew.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct RecentFrame {
-    samples: Vec<MapSample>,
-    sum: BandedSum,
+    samples: Vec<LineSample>,
+    /// Samples of the frame before, and how much of their error is left.
+    previous: Vec<LineSample>,
+    phi: f64,
+    /// Measurements per sample.
+    white_share: f64,
+    sum: BandedSum<WIDTH>,
 }
 
-/// An observed point in the map.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct MapSample {
-    /// Position, map frame, metres.
-    pub point: Point3<f64>,
-    /// Information before the robust kernel, 1/m^2.
-    pub information: f64,
-}
+/// Control points that one frame may couple: what lies in a crop box, and some to spare.
+pub const WIDTH: usize = 28;
 
-/// Brings an observation into the map: the samples that enter it, with their share of the line's information.
-#[must_use]
-pub fn map_samples(
-    observation: &LaneObservation,
-    map_from_vehicle: &Pose,
-    camera: &Point3<f64>,
-    params: &LandmarkParams,
-) -> Vec<MapSample> {
-    let count = observation.samples.len().div_ceil(params.sample_stride);
-    let share = (params.witnesses / count as f64).min(1.0);
-    let sample = |sample: &crate::observation::ObservedPoint| {
-        let range_m = (sample.point_vehicle.xy() - camera.xy()).norm();
-        MapSample {
-            point: map_from_vehicle * sample.point_vehicle,
-            information: share * sigma_at(&params.noise, range_m).powi(-2),
-        }
+/// The samples of an observation that enter the map.
+///
+/// They stand at whole multiples of the step along the line, so that successive frames have the same ranges.
+#[allow(clippy::cast_possible_truncation)] // stations within the crop box
+fn samples_of(observation: &LaneObservation, map_from_vehicle: &Pose, step_m: f64) -> Vec<LineSample> {
+    let (from, to) = observation.reported;
+    let (first, last) = ((from / step_m).ceil() as i32, (to / step_m).floor() as i32);
+    let sample = |station: i32| {
+        let range_m = f64::from(station) * step_m;
+        LineSample { station, range_m, point: map_from_vehicle * observation.point_at(range_m) }
     };
-    observation.samples.iter().step_by(params.sample_stride).map(sample).collect()
+    (first..=last).map(sample).collect()
+}
+
+/// A term of one sample that errs on its own (the paper's).
+fn independent_term(placed: &PlacedSample, distance_m: f64, share: f64, params: &LandmarkParams) -> Term {
+    let robust = if distance_m <= params.huber_m { 1.0 } else { params.huber_m / distance_m };
+    Term {
+        first: placed.first,
+        weights: placed.weights,
+        target: placed.sample.point.coords,
+        information: share * robust * sigma_at(&params.noise, placed.sample.range_m).powi(-2),
+    }
+}
+
+impl ControlPointAt for Landmark {
+    fn position(&self, knot: Knot) -> Vector3<f64> {
+        self.positions()[self.index_of(knot)].coords
+    }
 }
 
 impl Landmark {
@@ -102,8 +115,9 @@ impl Landmark {
         observation: &LaneObservation,
         map_from_vehicle: &Pose,
         time: TimestampNs,
-        params: &LandmarkParams,
+        all: &Params,
     ) -> Option<Self> {
+        let params = &all.landmark;
         let points = growth::begin(observation, map_from_vehicle, &growth_rule(params));
         let least = match params.ends {
             EndRule::Open => 4,
@@ -125,6 +139,7 @@ impl Landmark {
             folded: BandedSum::default(),
             recent: VecDeque::with_capacity(params.window_frames + 1),
             stale: None,
+            last_samples: None,
         };
         for point in &points {
             lane.append(*point, params);
@@ -141,7 +156,7 @@ impl Landmark {
 
     /// What is known of the control points.
     #[must_use]
-    pub fn information(&self) -> &BandedInformation {
+    pub fn information(&self) -> &BandedInformation<WIDTH> {
         &self.information
     }
 
@@ -237,31 +252,46 @@ impl Landmark {
         !behind.is_empty() || !before.is_empty()
     }
 
-    /// Takes the samples of one frame into the information and solves.
+    /// Takes one frame's observation into the information and solves; `near` are knots between which it lies.
     ///
-    /// `near` are knots between which the samples lie.
-    pub fn smooth(&mut self, samples: Vec<MapSample>, near: (Knot, Knot), params: &LandmarkParams) {
-        let sum = self.linearise(&samples, near, params);
+    /// `seconds` have passed since the lane was last seen.
+    pub fn smooth(
+        &mut self,
+        observation: &LaneObservation,
+        map_from_vehicle: &Pose,
+        seconds: f64,
+        near: (Knot, Knot),
+        all: &Params,
+    ) {
+        let samples = samples_of(observation, map_from_vehicle, all.line_error.step_m);
+        let previous = self.last_samples.take().unwrap_or_default();
+        let phi = if previous.is_empty() { 0.0 } else { (-seconds.max(0.0) / all.line_error.correlation_s).exp() };
+        let measured = observation.measured as f64 / samples.len().max(1) as f64;
+        let frame = RecentFrame { samples, previous, phi, white_share: measured.min(1.0), sum: BandedSum::default() };
+        let sum = self.linearise(&frame, near, all);
         self.mark_sum(&sum);
-        self.recent.push_back(RecentFrame { samples, sum });
-        if self.recent.len() > params.window_frames {
-            self.fold_oldest(near, params);
+        self.last_samples = Some(frame.samples.clone());
+        self.recent.push_back(RecentFrame { sum, ..frame });
+        if self.recent.len() > all.landmark.window_frames {
+            self.fold_oldest(near, all);
         }
         self.solve();
     }
 
     /// Evaluates the oldest recent frame at the lane as it is now, for the last time.
-    fn fold_oldest(&mut self, near: (Knot, Knot), params: &LandmarkParams) {
+    fn fold_oldest(&mut self, near: (Knot, Knot), all: &Params) {
         let Some(oldest) = self.recent.pop_front() else { return };
-        let sum = if params.window_frames == 0 { oldest.sum } else {
+        let sum = if all.landmark.window_frames == 0 {
+            oldest.sum
+        } else {
             self.mark_sum(&oldest.sum);
-            self.linearise(&oldest.samples, near, params)
+            self.linearise(&oldest, near, all)
         };
         self.mark_sum(&sum);
         self.folded.absorb(&sum);
     }
 
-    fn mark_sum(&mut self, sum: &BandedSum) {
+    fn mark_sum(&mut self, sum: &BandedSum<WIDTH>) {
         if let Some((first, last)) = sum.span() {
             self.mark(first, last);
         }
@@ -276,24 +306,38 @@ impl Landmark {
         self.information.solve();
     }
 
-    /// The terms of some samples at the lane as it is now. Samples beyond its ends say nothing.
-    fn linearise(&self, samples: &[MapSample], near: (Knot, Knot), params: &LandmarkParams) -> BandedSum {
+    /// The terms of one frame at the lane as it is now. Samples beyond its ends say nothing.
+    fn linearise(&self, frame: &RecentFrame, near: (Knot, Knot), all: &Params) -> BandedSum<WIDTH> {
         let mut sum = BandedSum::default();
-        let Some(curve) = self.curve(params.ends) else { return sum };
-        let mut walk = FootWalk::new(self, &curve, near, params);
-        for sample in samples {
-            let Some(foot) = walk.foot_point(&sample.point) else { continue };
-            let support = curve.support(foot.parameter);
-            let robust = if foot.distance_m <= params.huber_m { 1.0 } else { params.huber_m / foot.distance_m };
-            let term = Term {
-                first: self.information.knot(support.first),
-                weights: support.weights,
-                target: sample.point.coords,
-                information: sample.information * robust,
-            };
-            sum.add(&term, self.information.anchor());
+        let samples = self.place(&frame.samples, near, &all.landmark);
+        if all.line_error.enabled {
+            let previous = self.place(&frame.previous, near, &all.landmark);
+            let plain: Vec<PlacedSample> = samples.iter().map(|(placed, _)| *placed).collect();
+            let before: Vec<PlacedSample> = previous.iter().map(|(placed, _)| *placed).collect();
+            let terms = line_terms(&plain, &before, frame.phi, frame.white_share, WIDTH, self, &all.line_error);
+            for term in &terms {
+                sum.add_dense(term, self.information.anchor());
+            }
+        } else {
+            let share = (all.landmark.witnesses / samples.len() as f64).min(1.0);
+            for (placed, distance_m) in &samples {
+                sum.add(&independent_term(placed, *distance_m, share, &all.landmark), self.information.anchor());
+            }
         }
         sum
+    }
+
+    /// Samples with their foot points' control points and distances; those beyond the ends are left out.
+    fn place(&self, samples: &[LineSample], near: (Knot, Knot), params: &LandmarkParams) -> Vec<(PlacedSample, f64)> {
+        let Some(curve) = self.curve(params.ends) else { return Vec::new() };
+        let mut walk = FootWalk::new(self, &curve, near, params);
+        let place = |sample: &LineSample| {
+            let foot = walk.foot_point(&sample.point)?;
+            let support = curve.support(foot.parameter);
+            let first = self.information.knot(support.first);
+            Some((PlacedSample { sample: *sample, first, weights: support.weights }, foot.distance_m))
+        };
+        samples.iter().filter_map(place).collect()
     }
 
     /// Counts this frame's votes on where the line begins and ends.
@@ -312,10 +356,8 @@ impl Landmark {
         let (reported_from, certain_from) = (place(observation.reported.0), place(observation.certain.0));
         let (certain_to, reported_to) = (place(observation.certain.1), place(observation.reported.1));
         let along = |a: f64, b: f64| if a <= b { (a, b) } else { (b, a) };
-        let sighting = Sighting {
-            reported: along(reported_from, reported_to),
-            certain: along(certain_from, certain_to),
-        };
+        let sighting =
+            Sighting { reported: along(reported_from, reported_to), certain: along(certain_from, certain_to) };
         let from = (near.0 as f64).max(head);
         let to = head + curve.last_parameter();
         let mut extent = std::mem::take(&mut self.extent);
@@ -335,7 +377,7 @@ impl Landmark {
             return Some((first, last));
         }
         let head = self.information.head() as f64;
-        let (from, to) = self.extent.drawn()?;
+        let (from, to) = self.extent.drawn(params.drawn_share)?;
         let (from, to) = ((from - head).max(first), (to - head).min(last));
         (to > from).then_some((from, to))
     }
@@ -353,13 +395,20 @@ impl Landmark {
             self.append(point, params);
         }
         let near = self.knots();
-        let samples: Vec<MapSample> = other
-            .positions()
-            .iter()
-            .zip(&variances)
-            .map(|(point, variance)| MapSample { point: *point, information: 1.0 / variance.max(1e-6) })
-            .collect();
-        let sum = self.linearise(&samples, near, params);
+        let sample = |point: &Point3<f64>| LineSample { station: 0, range_m: 0.0, point: *point };
+        let samples: Vec<LineSample> = other.positions().iter().map(sample).collect();
+        let mut variance_of = samples.iter().zip(&variances);
+        let mut sum = BandedSum::default();
+        for (placed, _) in self.place(&samples, near, params) {
+            // `place` keeps the order, so the variances are walked along with it.
+            let variance = variance_of.find(|(sample, _)| sample.point == placed.sample.point).map_or(1.0, |(_, v)| *v);
+            let information = 1.0 / variance.max(1e-6);
+            let target = placed.sample.point.coords;
+            sum.add(
+                &Term { first: placed.first, weights: placed.weights, target, information },
+                self.information.anchor(),
+            );
+        }
         self.mark_sum(&sum);
         self.folded.absorb(&sum);
         self.absorb_votes(other, params);

@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Point3};
 
 use super::Mapper;
 use crate::{
-    geometry::Pose,
+    geometry::{Pose, polyline::length_m},
     landmark::Landmark,
     lane_map::{ControlPoint, LocalLane, LocalWindow, MapLane},
     params::{Params, Preset},
@@ -23,7 +23,8 @@ pub(super) fn is_shown(lane: &Landmark, params: &Params) -> bool {
     match params.preset {
         Preset::Paper => lane.observations >= params.landmark.least_observations,
         Preset::Default => {
-            lane.observations >= params.landmark.least_observations && lane.existence.probability() > 0.6
+            lane.observations >= params.landmark.least_observations
+                && lane.existence.probability() > params.landmark.shown_existence
         }
     }
 }
@@ -75,14 +76,24 @@ pub(super) fn local_map(mapper: &Mapper, window: &LocalWindow) -> Vec<LocalLane>
         let to = to.min(lane.index_of(run.last) as f64);
         let points = sample(&curve, from, to, PIECES_PER_CHORD);
         let points_vehicle = in_window(&points, &pose, window, &mapper.sensor);
-        if points_vehicle.len() >= 2 {
+        if points_vehicle.len() < 2 || length_m(&points_vehicle) < mapper.params.landmark.shown_in_window_m {
+            continue;
+        }
+        let in_image: Vec<Point3<f64>> =
+            points_vehicle.iter().filter(|point| mapper.sensor.sees(point)).copied().collect();
+        if seen_now || length_m(&in_image) >= mapper.params.landmark.shown_in_image_m {
             local.push(LocalLane { id: lane.id, category: lane.category.best(), points_vehicle });
         }
     }
     local
 }
 
-fn in_window(points: &[Point3<f64>], map_from_vehicle: &Pose, window: &LocalWindow, sensor: &Sensor) -> Vec<Point3<f64>> {
+fn in_window(
+    points: &[Point3<f64>],
+    map_from_vehicle: &Pose,
+    window: &LocalWindow,
+    sensor: &Sensor,
+) -> Vec<Point3<f64>> {
     let camera = sensor.ground_offset();
     let inside = |point: &Point3<f64>| {
         let offset = point.coords - camera;

@@ -15,7 +15,7 @@ use crate::{
     },
     lane_map::LaneId,
     observation::LaneObservation,
-    params::{ObservationParams, Params},
+    params::Params,
     sensor::Sensor,
     spline::sampling::sample,
     tracking::{Correspondence, MatchedLane},
@@ -38,7 +38,12 @@ pub(super) struct Scene {
 
 impl Scene {
     /// The lanes around a predicted pose.
-    pub fn around(map_from_vehicle: &Pose, lanes: &BTreeMap<LaneId, Landmark>, index: &LaneIndex, params: &Params) -> Self {
+    pub fn around(
+        map_from_vehicle: &Pose,
+        lanes: &BTreeMap<LaneId, Landmark>,
+        index: &LaneIndex,
+        params: &Params,
+    ) -> Self {
         let middle = map_from_vehicle * Point3::new(MIDDLE_M, 0.0, 0.0);
         let (mut runs, mut shapes) = (Vec::new(), Vec::new());
         for run in index.within(&middle, RADIUS_M + STALE_M) {
@@ -131,14 +136,12 @@ pub(super) fn near_knots(lane: &Landmark, map_from_vehicle: &Pose, observation: 
 }
 
 /// How surely the detector would report a line that runs through a place (vehicle frame), in `[0, 1]`.
-pub(super) fn visibility(point_vehicle: &Point3<f64>, sensor: &Sensor, params: &ObservationParams) -> f64 {
-    /// Up to here a detector reports whatever it reports at all, metres.
-    const SURE_M: f64 = 30.0;
-    /// From here on it reports nothing for sure, metres.
-    const BLIND_M: f64 = 58.0;
+pub(super) fn visibility(point_vehicle: &Point3<f64>, sensor: &Sensor, params: &Params) -> f64 {
+    let (sure_m, blind_m) = (params.landmark.sure_range_m, params.landmark.blind_range_m);
+    let params = &params.observation;
     let offset = point_vehicle - Point3::from(sensor.ground_offset());
     let outside = offset.x < params.ahead_from_m || offset.y.abs() > params.side_m || !sensor.sees(point_vehicle);
-    if outside { 0.0 } else { ((BLIND_M - offset.xy().norm()) / (BLIND_M - SURE_M)).clamp(0.0, 1.0) }
+    if outside { 0.0 } else { ((blind_m - offset.xy().norm()) / (blind_m - sure_m)).clamp(0.0, 1.0) }
 }
 
 /// Chance that a frame at this pose reports a lane that exists.
@@ -156,7 +159,7 @@ pub(super) fn detection_probability(
             continue;
         }
         let point = map_from_vehicle.inverse_transform_point(&lane.positions()[index]);
-        let visible = visibility(&point, sensor, &params.observation);
+        let visible = visibility(&point, sensor, params);
         length += visible;
         side += visible * point.y.abs();
     }

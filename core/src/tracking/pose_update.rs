@@ -280,21 +280,30 @@ mod tests {
 
     /// Three straight lines along x, seen from a vehicle whose true pose is `truth`.
     fn scene(truth: &Pose) -> Vec<MatchedLane<'static>> {
-        [-3.5, 0.0, 3.5].iter().map(|y| {
-            let points_vehicle: Vec<Point3<f64>> =
-                (2..16).map(|k| truth.inverse_transform_point(&Point3::new(3.0 * f64::from(k), *y, 0.0))).collect();
-            let points = points_vehicle.clone();
-            let y = *y;
-            MatchedLane {
-                points_vehicle,
-                foot_points: Box::new(move |pose| {
-                    points.iter().map(|p| {
-                        let placed = pose * p;
-                        Some(Correspondence { foot_map: Point3::new(placed.x, y, 0.0), tangent_map: Vector3::x() })
-                    }).collect()
-                }),
-            }
-        }).collect()
+        [-3.5, 0.0, 3.5]
+            .iter()
+            .map(|y| {
+                let points_vehicle: Vec<Point3<f64>> =
+                    (2..16).map(|k| truth.inverse_transform_point(&Point3::new(3.0 * f64::from(k), *y, 0.0))).collect();
+                let points = points_vehicle.clone();
+                let y = *y;
+                MatchedLane {
+                    points_vehicle,
+                    foot_points: Box::new(move |pose| {
+                        points
+                            .iter()
+                            .map(|p| {
+                                let placed = pose * p;
+                                Some(Correspondence {
+                                    foot_map: Point3::new(placed.x, y, 0.0),
+                                    tangent_map: Vector3::x(),
+                                })
+                            })
+                            .collect()
+                    }),
+                }
+            })
+            .collect()
     }
 
     proptest! {
@@ -336,8 +345,10 @@ mod tests {
         let params = params();
         let pose = Pose::identity();
         let points: Vec<Point3<f64>> = (1..9).map(|k| Point3::new(5.0 * f64::from(k), 1.0, 0.0)).collect();
-        let feet: Vec<Option<Correspondence>> = points.iter()
-            .map(|p| Some(Correspondence { foot_map: Point3::new(p.x, 0.9, 0.0), tangent_map: Vector3::x() })).collect();
+        let feet: Vec<Option<Correspondence>> = points
+            .iter()
+            .map(|p| Some(Correspondence { foot_map: Point3::new(p.x, 0.9, 0.0), tangent_map: Vector3::x() }))
+            .collect();
         let (hessian, gradient, _) =
             LineSums::of(Axis::Lateral, &points, &feet, &pose, &params).without_line_error(Axis::Lateral, &params);
         let n = points.len();

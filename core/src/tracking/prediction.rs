@@ -32,9 +32,9 @@ impl PoseEstimate {
     pub fn predict(&self, previous_odometry: &Pose, odometry: &Odometry, params: &TrackingParams) -> Self {
         let motion = previous_odometry.inverse() * odometry.odometry_from_vehicle;
         let carry = transport(&motion);
-        let noise = odometry.motion_covariance.unwrap_or_else(|| {
-            covariance_from_sigmas([params.odometry_sigma_m; 3], [params.odometry_sigma_rad; 3])
-        });
+        let noise = odometry
+            .motion_covariance
+            .unwrap_or_else(|| covariance_from_sigmas([params.odometry_sigma_m; 3], [params.odometry_sigma_rad; 3]));
         let covariance = carry * self.covariance * carry.transpose() + noise;
         Self {
             map_from_vehicle: self.map_from_vehicle * motion,

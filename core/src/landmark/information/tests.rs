@@ -47,11 +47,11 @@ fn place(knot: Knot) -> Vector3<f64> {
 }
 
 /// Grows a lane at random at both ends and compares with the batch after every solution.
-fn grow_and_compare(seed: u64, frames: usize) {
+fn grow_and_compare<const W: usize>(seed: u64, frames: usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut lane = BandedInformation::new(Point3::from(place(0)));
+    let mut lane = BandedInformation::<W>::new(Point3::from(place(0)));
     let mut batch = Batch::default();
-    let add = |lane: &mut BandedInformation, batch: &mut Batch, term: Term| {
+    let add = |lane: &mut BandedInformation<W>, batch: &mut Batch, term: Term| {
         lane.add(&term);
         batch.terms.push(term);
     };
@@ -97,12 +97,13 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     #[test]
     fn incremental_equals_batch_under_random_growth_at_both_ends(seed in any::<u64>()) {
-        grow_and_compare(seed, 20);
+        grow_and_compare::<4>(seed, 20);
+        grow_and_compare::<28>(seed, 20);
     }
 }
 
 /// A long lane with data everywhere, as a drive leaves it.
-fn long_lane(count: Knot) -> BandedInformation {
+fn long_lane(count: Knot) -> BandedInformation<4> {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let mut lane = BandedInformation::new(Point3::origin());
     for knot in 0..count {
@@ -136,7 +137,7 @@ fn a_change_in_the_middle_of_a_long_lane_dies_out_to_the_last_bit() {
 fn a_restored_lane_has_the_same_bits_and_goes_on_with_the_same_bits() {
     let mut lane = long_lane(300);
     let bytes = postcard::to_stdvec(&lane).unwrap();
-    let mut restored: BandedInformation = postcard::from_bytes(&bytes).unwrap();
+    let mut restored: BandedInformation<4> = postcard::from_bytes(&bytes).unwrap();
     assert_eq!(restored.factor, lane.factor);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let term = spline_term(&mut rng, 250, place(251));

@@ -5,9 +5,12 @@
 
 pub mod assignment;
 pub mod chamfer;
+pub mod clipper;
 pub mod consistency;
 pub mod joint;
+pub mod lmr;
 pub mod shape;
+pub mod shell;
 
 pub use chamfer::associate_by_chamfer;
 pub use joint::associate_jointly;

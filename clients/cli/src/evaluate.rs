@@ -1,5 +1,8 @@
 //! `lanemap evaluate`: the paper's three measures on recorded drives, for both presets.
 
+mod association;
+mod association_method;
+mod association_pairs;
 mod drives;
 mod map_quality;
 mod map_table;
@@ -25,6 +28,8 @@ enum Measure {
     Map(map_quality::MapArgs),
     /// Relative pose error under odometry noise, beside odometry and beside the limit where only the error along the road remains.
     Pose(pose::PoseArgs),
+    /// Association of the true lanes of two frames with a wrong pose between them, beside the paper's baselines.
+    Association(association::AssociationArgs),
 }
 
 /// What every measure takes.
@@ -83,6 +88,7 @@ pub fn run(args: &EvaluateArgs) -> anyhow::Result<ExitCode> {
     match &args.measure {
         Measure::Map(args) => map_quality::run(args)?,
         Measure::Pose(args) => pose::run(args)?,
+        Measure::Association(args) => association::run(args)?,
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -26,22 +26,27 @@ impl AssociationScore {
         Self { correct, claimed: claimed.len(), possible: in_both.len() }
     }
 
-    /// Share of the claims that are right; 0 without a claim.
+    /// Share of the claims that are right; 0 without a claim where there was something to claim.
     #[must_use]
     pub fn precision(&self) -> f64 {
-        self.correct as f64 / self.claimed.max(1) as f64
+        self.share(self.correct, self.claimed)
     }
 
-    /// Share of the common lanes that were found; 0 without common lanes.
+    /// Share of the common lanes that were found; 0 without common lanes where something was claimed.
     #[must_use]
     pub fn recall(&self) -> f64 {
-        self.correct as f64 / self.possible.max(1) as f64
+        self.share(self.correct, self.possible)
     }
 
     /// Harmonic mean of precision and recall; 0 where both are.
     #[must_use]
     pub fn f1(&self) -> f64 {
-        2.0 * self.correct as f64 / (self.claimed + self.possible).max(1) as f64
+        self.share(2 * self.correct, self.claimed + self.possible)
+    }
+
+    /// Nothing claimed where nothing was to be found is right, and counts as 1, as the authors count it.
+    fn share(&self, part: usize, whole: usize) -> f64 {
+        if self.claimed + self.possible == 0 { 1.0 } else { part as f64 / whole.max(1) as f64 }
     }
 }
 
@@ -80,5 +85,27 @@ impl AssociationMean {
     #[must_use]
     pub fn recall(&self) -> f64 {
         self.recall_sum / self.pairs.max(1) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn silence_is_right_where_there_is_nothing_to_find_and_wrong_elsewhere() {
+        let ratios = |score: &AssociationScore| format!("{} {} {}", score.f1(), score.precision(), score.recall());
+        assert_eq!(ratios(&AssociationScore::new(&[], &[])), "1 1 1");
+        assert_eq!(ratios(&AssociationScore::new(&[], &[1, 2])), "0 0 0");
+        assert_eq!(ratios(&AssociationScore::new(&[(1, 1)], &[])), "0 0 0");
+    }
+
+    #[test]
+    fn the_mean_is_over_pairs_of_frames_and_not_over_lanes() {
+        let mut mean = AssociationMean::default();
+        mean.add(&AssociationScore::new(&[(1, 1), (2, 2), (3, 3), (4, 4)], &[1, 2, 3, 4]));
+        mean.add(&AssociationScore::new(&[(1, 2)], &[1]));
+        assert_eq!(mean.pairs, 2);
+        assert!((mean.f1() - 0.5).abs() < 1e-12);
     }
 }

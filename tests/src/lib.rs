@@ -5,5 +5,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::missing_panics_doc)]
 
 pub mod drives;
+pub mod folders;
 pub mod raw_stream;
 pub mod servers;

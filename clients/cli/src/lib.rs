@@ -1,0 +1,69 @@
+//! The `lanemap` command: serve, replay, evaluate, simulate, demo.
+//!
+//! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
+//! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
+
+use std::{io::IsTerminal, process::ExitCode};
+
+use clap::{Parser, Subcommand};
+
+mod demo;
+mod evaluate;
+mod replay;
+mod serve;
+mod signal;
+mod simulate;
+
+/// Streams lane detections into lane maps.
+#[derive(Debug, Parser)]
+#[command(name = "lanemap", version, max_term_width = 110)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Serves vehicles over gRPC and map readers over HTTP.
+    Serve(Box<serve::ServeArgs>),
+    /// Replays recorded drives (OpenLane folders) into a server, or into a mapper in this process.
+    Replay(Box<replay::ReplayArgs>),
+    /// Measures maps, poses and associations as the paper's tables do.
+    Evaluate(evaluate::EvaluateArgs),
+    /// Serves, with a simulated fleet driving through a town: something to look at.
+    Demo(demo::DemoArgs),
+    /// Makes synthetic drives with their truth, as OpenLane folders.
+    Simulate(simulate::SimulateArgs),
+}
+
+/// Runs the command line of this process.
+#[must_use]
+pub fn run() -> ExitCode {
+    let cli = Cli::parse();
+    log_to_stderr();
+    let done = match cli.command {
+        Command::Serve(args) => serve::run(&args),
+        Command::Replay(args) => replay::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Demo(args) => demo::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
+    };
+    match done {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business.
+const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn";
+
+/// Logs to stderr, in colour where that is a terminal.
+fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(DEFAULT_LOG));
+    let colour = std::io::stderr().is_terminal();
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colour).with_writer(std::io::stderr).init();
+}

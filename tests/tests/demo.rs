@@ -13,7 +13,7 @@ use serde_json::Value;
 use tokio::time::{interval, timeout};
 
 /// Longest wait for something that takes a second or two on an idle machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 /// Longest that a shutdown may take.
 const SHUTDOWN: Duration = Duration::from_secs(10);
 

@@ -29,7 +29,7 @@ pub struct DemoArgs {
     /// Address and port for gRPC and HTTP; port 0 takes any free one
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
     listen: SocketAddr,
-    /// Folder of the embedded store; made where it does not exist
+    /// Folder of the embedded store; made where it does not exist. Delete it to begin with an empty map
     #[arg(long, value_name = "DIR", default_value = "lanemap-data")]
     data_dir: PathBuf,
     /// Number of vehicles

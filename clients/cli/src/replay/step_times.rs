@@ -45,10 +45,14 @@ impl StepTimes {
     }
 
     /// Mean step of each kilometre driven, microseconds; `None` for a kilometre without a step.
+    ///
+    /// A rest of less than a tenth of a kilometre counts with the kilometre before it.
     pub fn means_per_km_us(&self) -> Vec<Option<f64>> {
+        let length_m = self.steps.last().map_or(0.0, |(driven_m, _)| *driven_m);
+        let last = kilometre_of(length_m - SHORT_REST_M);
         let mut kilometres: Vec<(f64, u32)> = Vec::new();
         for (driven_m, took) in &self.steps {
-            let kilometre = kilometre_of(*driven_m);
+            let kilometre = kilometre_of(*driven_m).min(last);
             if kilometres.len() <= kilometre {
                 kilometres.resize(kilometre + 1, (0.0, 0));
             }
@@ -58,6 +62,9 @@ impl StepTimes {
         kilometres.into_iter().map(|(sum_us, steps)| (steps > 0).then(|| sum_us / f64::from(steps))).collect()
     }
 }
+
+/// A rest shorter than this is no kilometre of its own, metres.
+const SHORT_REST_M: f64 = 100.0;
 
 /// Farthest kilometre listed: a drive whose poses jump to the end of the world does not fill the memory.
 const MAX_KILOMETRES: f64 = 10_000.0;
@@ -70,6 +77,17 @@ fn kilometre_of(driven_m: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_short_rest_counts_with_the_kilometre_before_it() {
+        let mut drive = StepTimes::default();
+        for driven_m in [0.0, 500.0, 1_500.0, 2_000.4] {
+            drive.push(driven_m, Duration::from_micros(10));
+        }
+        assert_eq!(drive.means_per_km_us().len(), 2);
+        drive.push(2_150.0, Duration::from_micros(10));
+        assert_eq!(drive.means_per_km_us().len(), 3);
+    }
 
     #[test]
     fn figures_are_over_all_drives_and_means_along_one() {

@@ -1,8 +1,8 @@
 //! The progress of a replay on stderr: frames per second, lanes, lag.
 
-use std::time::Duration;
+use std::{fmt::Write, time::Duration};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 /// A progress bar; nothing is drawn where stderr is no terminal.
 pub struct Progress {
@@ -13,8 +13,12 @@ impl Progress {
     /// A bar for so many frames.
     pub fn new(frames: usize) -> Self {
         let bar = ProgressBar::new(frames as u64);
-        let style = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {per_sec}, {msg}, {eta} left")
-            .unwrap_or_else(|_| ProgressStyle::default_bar());
+        let style = ProgressStyle::with_template("{bar:24} {pos}/{len} frames, {rate} frames/s, {msg}, {eta} left")
+            .unwrap_or_else(|_| ProgressStyle::default_bar())
+            .with_key("rate", |state: &ProgressState, out: &mut dyn Write| {
+                // A bar that cannot be drawn is not worth an error.
+                let _ = write!(out, "{:.0}", state.per_sec());
+            });
         bar.set_style(style);
         bar.enable_steady_tick(Duration::from_millis(200));
         Self { bar }

@@ -108,6 +108,17 @@ async fn the_demo_answers_at_its_address_its_maps_grow_on_the_earth_and_ctrl_c_e
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_of_the_demo_starts_anew_when_its_drive_ends() {
+    let store = tempfile::tempdir().unwrap();
+    let mut demo = Running::start("demo", store.path(), &["--vehicles", "1", "--drive-km", "0.02"]);
+    let base = demo.address().strip_suffix("/viewer").unwrap().to_owned();
+    let in_state =
+        |state: &'static str| move |session: &Value| session["state"] == state && session["frames"].as_u64() > Some(0);
+    sessions_until(&base, |all| all.iter().any(in_state("closed")) && all.iter().any(in_state("live"))).await;
+    assert!(demo.interrupt().await.success());
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn serve_says_where_it_listens_and_ctrl_c_ends_it() {
     let store = tempfile::tempdir().unwrap();
     let mut server = Running::start("serve", store.path(), &[]);

@@ -18,8 +18,6 @@ use crate::signal;
 
 /// Where the simulated town lies: Turin, whose streets are a grid as well.
 const TURIN: Wgs84 = Wgs84 { latitude_deg: 45.0628, longitude_deg: 7.6688, height_m: 239.0 };
-/// Length of one drive, metres.
-const DRIVE_M: f64 = 4_000.0;
 /// Time that vehicles get to end their streams before the server does.
 const FLEET_GRACE: Duration = Duration::from_secs(3);
 
@@ -35,6 +33,9 @@ pub struct DemoArgs {
     /// Number of vehicles
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     vehicles: u32,
+    /// Length of one drive, km; at its end the vehicle starts anew elsewhere
+    #[arg(long, value_name = "KM", default_value_t = 4.0, value_parser = drive_km)]
+    drive_km: f64,
     /// Seed of the town and its drives
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -54,7 +55,7 @@ pub async fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
         .await
         .context("the demo does not start; --listen and --data-dir choose another address and another folder")?;
     let client = IngestClient::connect(server.url()).await.context("the demo's own server cannot be reached")?;
-    let fleet = fleet::Fleet::start(args.vehicles, &town(args.seed), turin(), &client);
+    let fleet = fleet::Fleet::start(args.vehicles, &town(args), turin(), &client);
     let url = server.url();
     println!("viewer  {url}/viewer\nlanes   {url}/collections/lanes/items\ngRPC    {url}");
     println!("{} vehicles are driving; Ctrl-C stops", args.vehicles);
@@ -64,12 +65,19 @@ pub async fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn town(seed: u64) -> Scenario {
+fn drive_km(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(km) if (0.01..=100.0).contains(&km) => Ok(km),
+        _ => Err(format!("{text:?} is not a length from 0.01 to 100 km")),
+    }
+}
+
+fn town(args: &DemoArgs) -> Scenario {
     Scenario {
         network: NetworkPlan::Grid { columns: 5, rows: 5, spacing_m: 420.0 },
-        length_m: DRIVE_M,
+        length_m: args.drive_km * 1e3,
         drives: 0,
-        ..Scenario::town(seed)
+        ..Scenario::town(args.seed)
     }
 }
 

@@ -141,11 +141,40 @@ export class LaneMap {
     this.#map.easeTo({ center: vehiclePosition(session), zoom, offset, duration: smooth(1000), easing: (part) => part });
   }
 
-  /** What is drawn: lines and their points, features on the screen, and whether nothing is left to be drawn. */
+  /** What is drawn: lines, the points handed over for them so far, and features on the screen. */
   get state() {
     const lines = [...this.#drawn.values()].reduce((total, keys) => total + keys.length, 0);
-    const rendered = this.#map.queryRenderedFeatures({ layers: CLICKABLE });
-    return { lines, points: this.#points, rendered: rendered.length, settled: this.#map.loaded() };
+    return { lines, points: this.#points, rendered: this.#onScreen().length };
+  }
+
+  /** Resolves when the map stands still and all that it was given is on the screen. */
+  async settled() {
+    this.#map.triggerRepaint();
+    await this.#map.once("idle");
+  }
+
+  /** The sessions that have a line on the screen. */
+  sessionsOnScreen() {
+    return [...new Set(this.#onScreen().map((feature) => feature.properties.session))].sort();
+  }
+
+  /** A pixel on some line that no panel covers; waits for the map to stand still. */
+  async somePointOfALine() {
+    await this.settled();
+    const { left, right, top, bottom } = this.#padding();
+    const { clientWidth, clientHeight } = this.#map.getContainer();
+    const free = [[left, top], [clientWidth - right, clientHeight - bottom]];
+    for (const { geometry } of this.#map.queryRenderedFeatures(free, { layers: ["solid", "curb"] })) {
+      for (const place of geometry.type === "LineString" ? geometry.coordinates : geometry.coordinates.flat()) {
+        const { x, y } = this.#map.project(place);
+        if (x > free[0][0] && x < free[1][0] && y > free[0][1] && y < free[1][1]) return [x, y];
+      }
+    }
+    return undefined;
+  }
+
+  #onScreen() {
+    return this.#map.queryRenderedFeatures({ layers: CLICKABLE });
   }
 
   /** Room for the panel: beside it on a desk, above it on a phone. */

@@ -63,12 +63,12 @@ export function laneLayers(colours, latitude, shown, chosen) {
     colours.white,
   ];
   const certain = ["interpolate", ["linear"], ["get", "existence"], 0.2, 0.25, 0.9, 1];
-  const layer = (id, filter, paint, cap = "butt") => ({
+  const layer = (id, filter, paint) => ({
     id,
     type: "line",
     source: "lanes",
     filter: filter ? ["all", shown, filter] : shown,
-    layout: { "line-cap": cap, "line-join": "round" },
+    layout: { "line-join": "round" },
     paint,
   });
   const line = (id, filter, paint) =>
@@ -79,11 +79,11 @@ export function laneLayers(colours, latitude, shown, chosen) {
   const apart = { "line-gap-width": breadth(PAINT, 0.9) };
 
   return [
-    layer("verge", undefined, { "line-color": colours.verge, "line-width": breadth([9, 12]) }, "round"),
+    layer("verge", undefined, { "line-color": colours.verge, "line-width": breadth([9, 12]) }),
     layer("chosen", ["==", ["get", "session"], chosen], {
       "line-color": colours.accent, "line-width": breadth([7, 10]),
-    }, "round"),
-    layer("asphalt", undefined, { "line-color": colours.asphalt, "line-width": breadth([5.6, 6]) }, "round"),
+    }),
+    layer("asphalt", undefined, { "line-color": colours.asphalt, "line-width": breadth([5.6, 6]) }),
     line("curb", among(CURB), { "line-width": breadth([0.32, 2.2]) }),
     line("unknown", ["==", CATEGORY, "unknown"], { "line-dasharray": [2, 3] }),
     line("solid", among(SINGLE.solid), {}),

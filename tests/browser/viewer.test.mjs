@@ -79,13 +79,17 @@ test("lanes are drawn and grow while vehicles drive, without a complaint or a re
 });
 
 test("paint is on the screen in the dark, and a click on a line tells its figures", async () => {
-  const { page, complaints, close } = await open({ ...DESK, colorScheme: "dark" });
+  const { id } = (await sessions()).find((session) => session.georeferenced && session.lanes > 0);
+  const { page, complaints, close } = await open({ ...DESK, colorScheme: "dark" }, `?session=${id}`);
   await untilDrawn(page);
-  assert.ok(await shareOfPaint(page) > 0.001, "hardly a light pixel");
-  // Moved by hand, the map stays where it is while the drives go on.
+  // Near the vehicle; then moved by hand and no longer following, so that the map stands still while the drive goes on.
+  await page.keyboard.press("f");
   await page.locator("#map canvas").focus();
   await page.keyboard.press("=");
-  const [x, y] = await page.evaluate(() => window.lanemap.somePointOfALine());
+  await page.keyboard.press("f");
+  const place = await page.waitForFunction(() => window.lanemap.somePointOfALine(), undefined, { timeout: PATIENCE_MS });
+  const [x, y] = await place.jsonValue();
+  assert.ok(await shareOfPaint(page) > 0.0005, "hardly a light pixel");
   await page.mouse.click(x, y);
   await page.locator(".maplibregl-popup").waitFor();
   assert.match(await page.locator(".maplibregl-popup").textContent(), /Lane \d+.*existence.*%.*lateral sigma.*cm/s);

@@ -4,7 +4,7 @@ const PERIOD_MS = 1000;
 const LONGEST_PAUSE_MS = 15000;
 
 export class Feed {
-  /** The sessions as the server last listed them. */
+  /** The sessions as the server last listed them, each with its number in the order in which they began. */
   sessions = [];
   /** What of each session was fetched last: its version and frame of reference. */
   #fetched = new Map();
@@ -50,7 +50,8 @@ export class Feed {
   async #poll() {
     const list = await this.#fetchChanged("sessions");
     if (list) {
-      this.sessions = list.sessions;
+      // The list has the newest first, and may be the end of a longer one.
+      this.sessions = list.sessions.map((session, index) => ({ ...session, number: list.total - index }));
       this.#forgetGone();
       this.#on.sessions(this.sessions, list.total);
     }

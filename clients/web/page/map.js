@@ -11,6 +11,8 @@ const EMPTY = { type: "FeatureCollection", features: [] };
 const EXACT = { type: "geojson", maxzoom: 24, tolerance: 0, data: EMPTY };
 /** Farther out than this a road is thinner than a pixel, and its lanes are not fetched. */
 const FARTHEST_ZOOM = 8;
+/** How far from a line a click still means it, pixels. */
+const REACH_PX = 6;
 
 export class LaneMap {
   /** Resolves once the style is drawn. */
@@ -47,11 +49,10 @@ export class LaneMap {
     this.#map.addControl(new maplibre.NavigationControl({ visualizePitch: true }), "top-right");
     this.#map.on("movestart", ({ originalEvent }) => originalEvent && on.moved());
     this.#map.on("dragstart", on.dragged);
-    for (const layer of CLICKABLE) {
-      this.#map.on("click", layer, (event) => this.#explain(event));
-      this.#map.on("mouseenter", layer, () => (this.#map.getCanvas().style.cursor = "pointer"));
-      this.#map.on("mouseleave", layer, () => (this.#map.getCanvas().style.cursor = ""));
-    }
+    this.#map.on("click", (event) => this.#explain(event));
+    this.#map.on("mousemove", ({ point }) => {
+      this.#map.getCanvas().style.cursor = this.#lineAt(point) ? "pointer" : "";
+    });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#restyle());
     this.ready = this.#map.once("load").then(() => {
       SESSION_COLOURS.forEach((colour, index) => {
@@ -91,7 +92,7 @@ export class LaneMap {
         session: session.id,
         local: !session.georeferenced,
         heading: session.vehicle.heading_deg,
-        icon: `vehicle-${colourIndex(session.id)}`,
+        icon: `vehicle-${colourIndex(session)}`,
         live: session.state === "live",
       },
     }));
@@ -164,7 +165,7 @@ export class LaneMap {
     const { left, right, top, bottom } = this.#padding();
     const { clientWidth, clientHeight } = this.#map.getContainer();
     const free = [[left, top], [clientWidth - right, clientHeight - bottom]];
-    for (const { geometry } of this.#map.queryRenderedFeatures(free, { layers: ["solid", "curb"] })) {
+    for (const { geometry } of this.#map.queryRenderedFeatures(free, { layers: CLICKABLE })) {
       for (const place of geometry.type === "LineString" ? geometry.coordinates : geometry.coordinates.flat()) {
         const { x, y } = this.#map.project(place);
         if (x > free[0][0] && x < free[1][0] && y > free[0][1] && y < free[1][1]) return [x, y];
@@ -177,11 +178,12 @@ export class LaneMap {
     return this.#map.queryRenderedFeatures({ layers: CLICKABLE });
   }
 
-  /** Room for the panel: beside it on a desk, above it on a phone. */
+  /** Room for the panel, beside it on a desk and above it on a phone, and for the banner. */
   #padding() {
     const { width, height } = document.getElementById("panel").getBoundingClientRect();
+    const banner = document.getElementById("local-banner").getBoundingClientRect();
     const phone = width > innerWidth * 0.8;
-    return { top: 60, right: 60, bottom: phone ? height + 30 : 50, left: phone ? 40 : width + 50 };
+    return { top: banner.bottom + 60, right: 60, bottom: phone ? height + 30 : 50, left: phone ? 40 : width + 50 };
   }
 
   #layers(colours) {
@@ -212,7 +214,15 @@ export class LaneMap {
     }
   }
 
-  #explain({ features: [{ properties }], lngLat }) {
+  /** A line at a pixel, or within a finger's breadth of it. */
+  #lineAt({ x, y }) {
+    const around = [[x - REACH_PX, y - REACH_PX], [x + REACH_PX, y + REACH_PX]];
+    return this.#map.queryRenderedFeatures(around, { layers: CLICKABLE })[0];
+  }
+
+  #explain({ point, lngLat }) {
+    const properties = this.#lineAt(point)?.properties;
+    if (!properties) return;
     const figures = {
       session: properties.session,
       existence: `${Math.round(properties.existence * 100)} %`,

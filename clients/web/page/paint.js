@@ -25,6 +25,7 @@ export function theme() {
     gridMajor: colour("grid-major"),
     verge: colour("verge"),
     asphalt: colour("asphalt"),
+    ribbon: colour("ribbon"),
     white: colour("white-paint"),
     yellow: colour("yellow-paint"),
     curb: colour("curb"),
@@ -46,6 +47,8 @@ const CURB = ["left_curb", "right_curb"];
 
 /** Breadth of one painted line, metres and the least pixels. */
 const PAINT = [0.16, 1.7];
+/** Farther out than the first a road is a plain ribbon; nearer than the second its paint is seen in full. */
+const [RIBBON_ZOOM, PAINT_ZOOM] = [14.5, 16.5];
 
 /**
  * The layers that draw the source "lanes", bottom first, of the features that `shown` (a filter) lets through.
@@ -63,6 +66,8 @@ export function laneLayers(colours, latitude, shown, chosen) {
     colours.white,
   ];
   const certain = ["interpolate", ["linear"], ["get", "existence"], 0.2, 0.25, 0.9, 1];
+  const visible = ["interpolate", ["linear"], ["zoom"], RIBBON_ZOOM, ["*", certain, 0.1], PAINT_ZOOM, certain];
+  const road = ["interpolate", ["linear"], ["zoom"], RIBBON_ZOOM, colours.ribbon, PAINT_ZOOM, colours.asphalt];
   const layer = (id, filter, paint) => ({
     id,
     type: "line",
@@ -72,7 +77,7 @@ export function laneLayers(colours, latitude, shown, chosen) {
     paint,
   });
   const line = (id, filter, paint) =>
-    layer(id, filter, { "line-color": colour, "line-opacity": certain, "line-width": breadth(PAINT), ...paint });
+    layer(id, filter, { "line-color": colour, "line-opacity": visible, "line-width": breadth(PAINT), ...paint });
   const beside = (categoriesToTheLeft, side) =>
     ["case", among(categoriesToTheLeft), -side, side];
   const dash = { "line-dasharray": [9, 11] };
@@ -83,7 +88,7 @@ export function laneLayers(colours, latitude, shown, chosen) {
     layer("chosen", ["==", ["get", "session"], chosen], {
       "line-color": colours.accent, "line-width": breadth([7, 10]),
     }),
-    layer("asphalt", undefined, { "line-color": colours.asphalt, "line-width": breadth([5.6, 6]) }),
+    layer("asphalt", undefined, { "line-color": road, "line-width": breadth([5.6, 5]) }),
     line("curb", among(CURB), { "line-width": breadth([0.32, 2.2]) }),
     line("unknown", ["==", CATEGORY, "unknown"], { "line-dasharray": [2, 3] }),
     line("solid", among(SINGLE.solid), {}),

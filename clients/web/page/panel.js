@@ -3,13 +3,13 @@
 import { LEGEND, swatch } from "./paint.js";
 
 /** Colours by which sessions are told apart: vehicles on the map and dots in the list. */
-export const SESSION_COLOURS = ["#2f9bff", "#ff7a45", "#3ecf8e", "#e255c5", "#a78bfa", "#18c5d9", "#f25f5c", "#8fbf26"];
+export const SESSION_COLOURS = [
+  "#2f9bff", "#ff7a45", "#3ecf8e", "#e255c5", "#a78bfa", "#18c5d9", "#f25f5c", "#8fbf26", "#f2b632", "#b98a5e",
+];
 
-/** The colour's number of a session: the same in every list and after every reload. */
-export function colourIndex(id) {
-  let sum = 0;
-  for (const letter of id) sum = (sum * 31 + letter.codePointAt(0)) % 100003;
-  return sum % SESSION_COLOURS.length;
+/** The colour's index of a session that has its number. */
+export function colourIndex(session) {
+  return session.number % SESSION_COLOURS.length;
 }
 
 const element = (id) => document.getElementById(id);
@@ -47,7 +47,7 @@ export class Panel {
     for (const [id, row] of this.#rows) {
       if (!alive.has(id)) this.#rows.delete(id), row.remove();
     }
-    list.map((session, index) => [session, count - index]).reverse().forEach(([session, number]) => this.#row(session, number));
+    for (const session of list.toReversed()) this.#row(session);
   }
 
   /** Marks a session, or none, as the chosen one. */
@@ -74,12 +74,12 @@ export class Panel {
     element("fold").setAttribute("aria-expanded", String(!folded));
   }
 
-  #row(session, number) {
+  #row(session) {
     let row = this.#rows.get(session.id);
     if (!row) {
       row = document.createElement("li");
       row.innerHTML = `<button type="button"><span class="dot"></span><span class="name"><span></span> <code></code></span><span class="state"></span><span class="figures"></span></button>`;
-      row.style.setProperty("--session", SESSION_COLOURS[colourIndex(session.id)]);
+      row.style.setProperty("--session", SESSION_COLOURS[colourIndex(session)]);
       row.querySelector("code").textContent = session.id;
       row.firstChild.title = `Fly to ${session.id}`;
       row.firstChild.setAttribute("aria-current", String(session.id === this.#chosen));
@@ -87,7 +87,7 @@ export class Panel {
       this.#rows.set(session.id, row);
       element("sessions").prepend(row);
     }
-    row.querySelector(".name span").textContent = `Drive ${number}`;
+    row.querySelector(".name span").textContent = `Drive ${session.number}`;
     const state = row.querySelector(".state");
     state.textContent = state.dataset.state = session.state;
     const where = session.georeferenced ? "" : " · own frame";

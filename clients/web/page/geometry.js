@@ -28,6 +28,16 @@ export function joinBoxes(boxes) {
   return [0, 1, 2, 3].map((side) => (side < 2 ? Math.min : Math.max)(...boxes.map((box) => box[side])));
 }
 
+/** Length on the ground of a GeoJSON geometry of lines, metres; heights aside. */
+export function lengthOf({ type, coordinates }) {
+  const lines = type === "MultiLineString" ? coordinates : [coordinates];
+  const step = (from, to) => {
+    const east = (to[0] - from[0]) * Math.cos((to[1] * Math.PI) / 180);
+    return METRES_PER_DEGREE * Math.hypot(east, to[1] - from[1]);
+  };
+  return lines.flatMap((line) => line.slice(1).map((to, index) => step(line[index], to))).reduce((sum, length) => sum + length, 0);
+}
+
 /** Degrees of latitude, and of longitude at `latitude`, that `metres` span. */
 export function degreesOf(metres, latitude) {
   const north = metres / METRES_PER_DEGREE;

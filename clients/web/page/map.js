@@ -1,7 +1,7 @@
 // The map: MapLibre with the lanes, the vehicles and the grid as its sources.
 
 import * as maplibre from "./maplibre-gl.mjs";
-import { joinBoxes, placeLocal, placeLocalBox, placeLocalGeometry } from "./geometry.js";
+import { joinBoxes, lengthOf, placeLocal, placeLocalBox, placeLocalGeometry } from "./geometry.js";
 import { Grid, gridLayers } from "./grid.js";
 import { CLICKABLE, laneLayers, theme } from "./paint.js";
 import { SESSION_COLOURS, colourIndex } from "./panel.js";
@@ -17,10 +17,8 @@ const REACH_PX = 6;
 export class LaneMap {
   /** Resolves once the style is drawn. */
   ready;
-  /** Ids of the lines that are drawn, by session. */
+  /** What is drawn, by session: the keys of its lines and their length together. */
   #drawn = new Map();
-  /** Points handed over so far. */
-  #points = 0;
   #chosen;
   #local = false;
   #latitude = 0;
@@ -47,7 +45,7 @@ export class LaneMap {
     });
     this.#map.addControl(new maplibre.ScaleControl({ maxWidth: 140 }), "bottom-right");
     this.#map.addControl(new maplibre.NavigationControl({ visualizePitch: true }), "top-right");
-    this.#map.on("movestart", ({ originalEvent }) => originalEvent && on.moved());
+    this.#map.on("move", ({ originalEvent }) => originalEvent && on.moved());
     this.#map.on("dragstart", on.dragged);
     this.#map.on("click", (event) => this.#explain(event));
     this.#map.on("mousemove", ({ point }) => {
@@ -72,15 +70,15 @@ export class LaneMap {
       properties: { ...properties, key: String(id), local: !session.georeferenced },
     }));
     const keys = new Set(features.map((feature) => feature.properties.key));
-    const remove = (this.#drawn.get(session.id) ?? []).filter((key) => !keys.has(key));
-    this.#drawn.set(session.id, [...keys]);
-    this.#points += features.reduce((total, { geometry }) => total + geometry.coordinates.length, 0);
+    const remove = (this.#drawn.get(session.id)?.keys ?? []).filter((key) => !keys.has(key));
+    const metres = features.reduce((total, { geometry }) => total + lengthOf(geometry), 0);
+    this.#drawn.set(session.id, { keys: [...keys], metres });
     this.#map.getSource("lanes").updateData({ remove, add: features });
   }
 
   /** Removes what was drawn of a session. */
   forget(id) {
-    this.#map.getSource("lanes").updateData({ remove: this.#drawn.get(id) ?? [] });
+    this.#map.getSource("lanes").updateData({ remove: this.#drawn.get(id)?.keys ?? [] });
     this.#drawn.delete(id);
   }
 
@@ -142,10 +140,10 @@ export class LaneMap {
     this.#map.easeTo({ center: vehiclePosition(session), zoom, offset, duration: smooth(1000), easing: (part) => part });
   }
 
-  /** What is drawn: lines, the points handed over for them so far, and features on the screen. */
+  /** What is drawn: the length of all lines, metres, and the number of features on the screen. */
   get state() {
-    const lines = [...this.#drawn.values()].reduce((total, keys) => total + keys.length, 0);
-    return { lines, points: this.#points, rendered: this.#onScreen().length };
+    const metres = [...this.#drawn.values()].reduce((total, session) => total + session.metres, 0);
+    return { metres, rendered: this.#onScreen().length };
   }
 
   /** Resolves when the map stands still and all that it was given is on the screen. */

@@ -73,7 +73,7 @@ impl Default for ServerConfig {
             publish_interval_ms: 150,
             unload_after_s: 60,
             keep_alive_s: 20,
-            shutdown_grace_s: 8,
+            shutdown_grace_s: 6,
         }
     }
 }

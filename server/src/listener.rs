@@ -11,7 +11,7 @@ use hyper_util::{
 use tokio::{
     net::{TcpListener, TcpStream},
     sync::Semaphore,
-    time::{sleep, timeout},
+    time::sleep,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -20,16 +20,17 @@ use crate::{config::ServerConfig, telemetry};
 /// Pause after a failed accept: out of file descriptors, most likely.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// Accepts connections until `stop`, then lets those that are open end within `grace`.
+/// Accepts connections until `stop`, then lets those that are open end until `deadline`.
 pub(crate) async fn serve(
     listener: TcpListener,
     router: Router,
     config: &ServerConfig,
     stop: CancellationToken,
-    grace: Duration,
+    deadline: impl Future<Output = ()>,
 ) {
     let builder = connection_builder(config);
     let graceful = GracefulShutdown::new();
+    let abort = CancellationToken::new();
     let places = Arc::new(Semaphore::new(config.max_connections));
     loop {
         let accepted = tokio::select! {
@@ -40,18 +41,27 @@ pub(crate) async fn serve(
         let service = TowerToHyperService::new(router.clone());
         let serving = builder.serve_connection_with_upgrades(TokioIo::new(connection), service).into_owned();
         let serving = graceful.watch(serving);
+        let abort = abort.clone();
         tokio::spawn(async move {
             metrics::gauge!(telemetry::CONNECTIONS).increment(1.0);
-            if let Err(error) = serving.await {
-                tracing::debug!(error, "a connection broke");
+            tokio::select! {
+                served = serving => if let Err(error) = served {
+                    tracing::debug!(error, "a connection broke");
+                },
+                () = abort.cancelled() => {}
             }
             metrics::gauge!(telemetry::CONNECTIONS).decrement(1.0);
             drop(place);
         });
     }
     drop(listener);
-    if timeout(grace, graceful.shutdown()).await.is_err() {
-        tracing::warn!("some connections were still open at the end of the grace time");
+    let ended = tokio::select! {
+        () = graceful.shutdown() => true,
+        () = deadline => false,
+    };
+    if !ended {
+        tracing::warn!("some connections were still open at the end of the grace time and are cut");
+        abort.cancel();
     }
 }
 

@@ -5,7 +5,12 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 use axum::Router;
 use lanemap_proto::v1::{self, ingest_service_server::IngestServiceServer, map_service_server::MapServiceServer};
 use thiserror::Error;
-use tokio::{net::TcpListener, sync::watch, task::JoinHandle, time::timeout};
+use tokio::{
+    net::TcpListener,
+    sync::watch,
+    task::JoinHandle,
+    time::{sleep, timeout},
+};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::{codec::CompressionEncoding, service::Routes};
 use tonic_health::{ServingStatus, server::HealthReporter};
@@ -23,6 +28,9 @@ use crate::{
 
 /// Time between two clean-ups of the metrics' histograms.
 const METRICS_UPKEEP: Duration = Duration::from_secs(5);
+
+/// Time for the journal's last commit, once every session has left.
+const JOURNAL_GRACE: Duration = Duration::from_secs(1);
 
 /// Why the service does not start.
 #[derive(Debug, Error)]
@@ -161,13 +169,20 @@ impl Running {
     async fn run(self, listener: TcpListener, router: Router) {
         let stop_listening = CancellationToken::new();
         let grace = self.config.shutdown_grace();
+        let overdue = {
+            let shutdown = self.shutdown.clone();
+            async move {
+                shutdown.cancelled().await;
+                sleep(grace).await;
+            }
+        };
         let serving = tokio::spawn({
             let (config, stop) = (Arc::clone(&self.config), stop_listening.clone());
-            async move { listener::serve(listener, router, &config, stop, grace).await }
+            async move { listener::serve(listener, router, &config, stop, overdue).await }
         });
         let upkeep = tokio::spawn(async {
             loop {
-                tokio::time::sleep(METRICS_UPKEEP).await;
+                sleep(METRICS_UPKEEP).await;
                 telemetry::metrics_handle().run_upkeep();
             }
         });
@@ -191,7 +206,7 @@ impl Running {
         }
         upkeep.abort();
         drop(self.registry);
-        if timeout(grace, self.committer.join()).await.is_err() {
+        if timeout(JOURNAL_GRACE, self.committer.join()).await.is_err() {
             tracing::warn!("the journal was still in use at the end of the grace time");
         }
     }

@@ -69,7 +69,13 @@ impl IngestGrpc {
         let Some((start, attachment)) = self.open(&mut incoming, &outbox).await else { return };
         outbox.accept(self.accepted(&attachment));
         let limits = self.config.frame_limits();
-        let with = pass_frames(&mut incoming, &outbox, &attachment, &start.point_frame, &limits).await;
+        let shutdown = self.shutdown.clone();
+        // What is cut off here was not acked: the vehicle sends it again.
+        let with = tokio::select! {
+            biased;
+            () = shutdown.cancelled() => Err(Error::ShuttingDown.into()),
+            with = pass_frames(&mut incoming, &outbox, &attachment, &start.point_frame, &limits) => with,
+        };
         self.detach(&outbox, &attachment, with).await;
     }
 
@@ -113,7 +119,10 @@ impl IngestGrpc {
                 }
                 Next::Finished => return None,
             };
-            outbox.refuse(&refusal).await;
+            tokio::select! {
+                () = outbox.refuse(&refusal) => {}
+                () = self.shutdown.cancelled() => {}
+            }
         }
         let refusal = out_of_turn("start", format!("missing after {MAX_REFUSALS_BEFORE_START} messages"));
         outbox.finish(Err(Error::Refused(Box::new(refusal)).into()));
@@ -177,11 +186,7 @@ async fn pass_frames(
             Next::Message(Message::Frame(message)) => match decode::frame(&message, point_frame, limits) {
                 Ok(frame) => {
                     let arrived = Instant::now();
-                    let send = attachment.send(|stream| Command::Frame { stream, frame: Box::new(frame), arrived });
-                    tokio::select! {
-                        sent = send => sent,
-                        () = incoming.shutdown.cancelled() => Err(Error::ShuttingDown),
-                    }
+                    attachment.send(|stream| Command::Frame { stream, frame: Box::new(frame), arrived }).await
                 }
                 Err(refusal) => {
                     outbox.refuse(&refusal).await;

@@ -89,6 +89,8 @@ pub(crate) struct Actor {
     next_publication: Instant,
     unload_at: Instant,
     frames_since_snapshot: u64,
+    /// It takes no new stream: it saves the drive and ends.
+    leaving: bool,
 }
 
 struct Stream {
@@ -136,6 +138,7 @@ impl Actor {
             next_publication: now,
             unload_at,
             frames_since_snapshot: 0,
+            leaving: false,
         }
     }
 
@@ -151,6 +154,7 @@ impl Actor {
     async fn serve(&mut self) -> Outcome {
         self.publish();
         while self.serve_next().await? {}
+        self.leaving = true;
         self.commands.close();
         while let Some(command) = self.commands.recv().await {
             self.take(command).await?;
@@ -213,6 +217,10 @@ impl Actor {
     }
 
     fn attach(&mut self, attach: Attach) {
+        if self.leaving {
+            // Its sender sees that it was dropped, and starts the next actor.
+            return;
+        }
         if let Some(before) = self.stream.take() {
             before.outbox.finish(Err(Error::Superseded.into()));
         }
@@ -230,11 +238,13 @@ impl Actor {
     }
 
     fn detach(&mut self, with: Result<(), Status>) {
-        if let Some(stream) = self.stream.take() {
+        let stream = self.stream.take();
+        self.unload_at = Instant::now() + self.surroundings.config.unload_after();
+        // Published before the vehicle hears of it: who waits for the end of a stream reads all of its frames.
+        self.publish();
+        if let Some(stream) = stream {
             stream.outbox.finish(with);
         }
-        self.unload_at = Instant::now() + self.surroundings.config.unload_after();
-        self.publish();
     }
 
     /// Puts a frame into the batch where it is next in its drive.
@@ -315,14 +325,12 @@ impl Actor {
             self.surroundings.journal.put_record(self.record.clone()).await?;
             self.save().await?;
         }
-        // Published before the vehicle hears of it: who waits for the end of a drive reads its whole map.
         let acked_sequence_inclusive = self.drive.last_sequence().map(|sequence| sequence.0);
-        let stream = self.stream.take();
-        self.detach(Ok(()));
-        if let Some(stream) = stream {
+        self.publish();
+        if let Some(stream) = &self.stream {
             stream.outbox.end(v1::SessionEnded { acked_sequence_inclusive });
-            stream.outbox.finish(Ok(()));
         }
+        self.detach(Ok(()));
         Ok(())
     }
 

@@ -80,3 +80,16 @@ impl Drive {
         map.encode_to_vec()
     }
 }
+
+/// Asserts that served bytes are those that a local mapper makes of the drive; says in lanes where they differ.
+#[track_caller]
+pub fn assert_same_map(served: &[u8], drive: &Drive) {
+    let expected = drive.expected_map_bytes();
+    if served == expected {
+        return;
+    }
+    let lanes = |bytes| v1::LaneMap::decode(bytes).unwrap().lanes;
+    let (served, expected) = (lanes(served), lanes(&expected));
+    let differ: Vec<_> = served.iter().zip(&expected).filter(|(a, b)| a != b).map(|(lane, _)| lane.id).collect();
+    panic!("the maps differ: {} lanes served, {} expected, ids that differ {differ:?}", served.len(), expected.len());
+}

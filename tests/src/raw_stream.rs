@@ -26,12 +26,27 @@ impl RawStream {
         Self::open_on(Channel::from_shared(url.to_owned()).unwrap().connect().await.unwrap()).await
     }
 
+    /// Opens a stream whose network buffers are small: a reader that stops is felt after 64 KiB.
+    pub async fn open_with_small_windows(url: &str) -> Self {
+        let endpoint = Channel::from_shared(url.to_owned()).unwrap();
+        let endpoint = endpoint.initial_stream_window_size(65_535).initial_connection_window_size(65_535);
+        Self::open_on(endpoint.connect().await.unwrap()).await
+    }
+
     /// Opens a stream on a connection.
     pub async fn open_on(channel: Channel) -> Self {
+        Self::try_open_on(channel).await.unwrap()
+    }
+
+    /// Opens a stream on a connection that may be closing.
+    ///
+    /// # Errors
+    /// The call's status, where it is turned away before it is a stream.
+    pub async fn try_open_on(channel: Channel) -> Result<Self, Status> {
         let (requests, messages) = mpsc::channel(16);
         let mut client = IngestServiceClient::new(channel);
-        let answers = client.stream_observations(ReceiverStream::new(messages)).await.unwrap().into_inner();
-        Self { requests: Some(requests), answers }
+        let answers = client.stream_observations(ReceiverStream::new(messages)).await?.into_inner();
+        Ok(Self { requests: Some(requests), answers })
     }
 
     /// Opens a stream and a session.
@@ -68,6 +83,9 @@ impl RawStream {
     }
 
     /// The next answer, or how the stream ended: `Ok(None)` where all is well.
+    ///
+    /// # Errors
+    /// The status with which the stream ended.
     pub async fn answer_or_end(&mut self) -> Result<Option<Response>, Status> {
         let answer = timeout(PATIENCE, self.answers.message()).await.expect("no answer");
         Ok(answer?.map(|answer| answer.message.expect("an empty answer")))
@@ -98,6 +116,9 @@ impl RawStream {
     }
 
     /// How the stream ends; what it still answers is passed over.
+    ///
+    /// # Errors
+    /// The status with which the stream ended.
     pub async fn end(&mut self) -> Result<(), Status> {
         while self.answer_or_end().await?.is_some() {}
         Ok(())

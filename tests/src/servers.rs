@@ -6,7 +6,9 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
+use lanemap_proto::v1::{self, map_service_client::MapServiceClient};
 use lanemap_server::{RunningServer, Server, ServerConfig};
+use prost::Message;
 
 /// Settings for a server of its own: any free port, the store in `folder`, everything else as users get it.
 #[must_use]
@@ -19,6 +21,13 @@ pub async fn start(folder: &Path) -> RunningServer {
     Server::start(config(folder)).await.unwrap()
 }
 
+/// The bytes of a session's map, as `MapService` gives it.
+pub async fn map_bytes(url: &str, session: &str) -> Vec<u8> {
+    let mut client = MapServiceClient::connect(url.to_owned()).await.unwrap();
+    let request = v1::GetLaneMapRequest { session_id: session.to_owned() };
+    client.get_lane_map(request).await.unwrap().into_inner().map.unwrap().encode_to_vec()
+}
+
 /// A server in a process of its own, which can be killed as no server in this process can.
 #[derive(Debug)]
 pub struct ServerProcess {
@@ -28,10 +37,10 @@ pub struct ServerProcess {
 }
 
 impl ServerProcess {
-    /// Starts `binary` on the store in `folder` and waits until it listens.
+    /// Starts `killable-server`, whose path is `binary`, on the store in `folder`, and waits until it listens.
     #[must_use]
     pub fn start(binary: &str, folder: &Path) -> Self {
-        let mut child = Command::new(binary).arg(folder).stdout(Stdio::piped()).spawn().unwrap();
+        let mut child = Command::new(binary).arg(folder).arg("127.0.0.1:0").stdout(Stdio::piped()).spawn().unwrap();
         let mut url = String::new();
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut url).unwrap();
         assert!(url.starts_with("http://"), "the server says {url:?}");

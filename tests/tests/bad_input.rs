@@ -1,5 +1,7 @@
 //! Promise: bad input is refused with field, value and limit; its stream and its neighbours go on.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
+
 use lanemap_proto::{encode, v1, v1::RefusalReason, v1::stream_observations_request::Message};
 use lanemap_tests::{
     drives::{self, Drive},

@@ -1,0 +1,79 @@
+//! Promise: a shutdown ends within 10 s with streams open, and loses nothing that was acked.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
+
+use std::time::Duration;
+
+use lanemap_proto::encode;
+use lanemap_tests::{drives, raw_stream::RawStream, servers};
+use tokio::time::timeout;
+use tonic::Code;
+
+/// The longest that a shutdown may take.
+const LONGEST: Duration = Duration::from_secs(10);
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_shutdown_ends_open_streams_and_keeps_what_was_acked() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let mut streams = Vec::new();
+    for seed in 0..8 {
+        let drive = drives::simulated(seed, 20);
+        let (mut stream, accepted) = RawStream::started(&server.url(), drive.wire_start()).await;
+        for frame in &drive.frames {
+            stream.send_frame(encode::frame(frame)).await;
+        }
+        stream.acked(20).await;
+        streams.push((drive, stream, accepted));
+    }
+    let not_started = RawStream::open(&server.url()).await;
+
+    timeout(LONGEST, server.shutdown()).await.expect("the shutdown takes too long");
+    drop(not_started);
+    for (_, stream, _) in &mut streams {
+        let status = stream.end().await.unwrap_err();
+        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+    }
+
+    let server = servers::start(folder.path()).await;
+    for (drive, _, accepted) in &streams {
+        let (_, resumed) = RawStream::started(&server.url(), drive.wire_start()).await;
+        assert_eq!(resumed.session_id, accepted.session_id);
+        assert_eq!(resumed.resume_after_sequence, Some(20));
+    }
+    timeout(LONGEST, server.shutdown()).await.expect("the shutdown takes too long");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_that_never_reads_holds_no_shutdown() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let drive = drives::simulated(1, 300);
+    let (deaf, _) = RawStream::started(&server.url(), drive.wire_start()).await;
+    let filling = async {
+        for frame in drive.frames.iter().cycle() {
+            deaf.send_frame(lanemap_proto::v1::Frame { odometry: None, ..encode::frame(frame) }).await;
+        }
+    };
+    // Frames without odometry are refused; once nobody reads the refusals, the stream takes no more frames.
+    timeout(Duration::from_secs(2), filling).await.unwrap_err();
+    timeout(LONGEST, server.shutdown()).await.expect("the shutdown takes too long");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_stream_is_turned_away_while_the_service_shuts_down() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let channel = tonic::transport::Channel::from_shared(server.url()).unwrap().connect().await.unwrap();
+    server.shutdown_token().cancel();
+    let mut stream = match timeout(LONGEST, async { RawStream::try_open_on(channel).await }).await.unwrap() {
+        Ok(stream) => stream,
+        // The connection was closed before the call.
+        Err(status) => {
+            assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+            return server.stopped().await;
+        }
+    };
+    assert_eq!(stream.end().await.unwrap_err().code(), Code::Unavailable);
+    timeout(LONGEST, server.stopped()).await.expect("the shutdown takes too long");
+}

@@ -21,6 +21,8 @@ pub use shape::LaneShape;
 pub struct PoseUncertainty {
     /// Standard deviation of the heading, radians.
     pub yaw_rad: f64,
-    /// Standard deviation of the position along and across the road, metres each.
-    pub position_m: f64,
+    /// Standard deviation of the position along the vehicle's x axis, metres.
+    pub along_m: f64,
+    /// Standard deviation of the position along the vehicle's y axis, metres.
+    pub across_m: f64,
 }

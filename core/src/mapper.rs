@@ -41,6 +41,8 @@ pub struct Mapper {
     pose: PoseEstimate,
     /// Odometry of the last frame; `None` before the first.
     odometry_from_vehicle: Option<Pose>,
+    /// Time of the last frame.
+    time: TimestampNs,
     lanes: BTreeMap<LaneId, Landmark>,
     index: LaneIndex,
     last_lane: u64,
@@ -86,6 +88,7 @@ impl Mapper {
             sensor,
             pose: PoseEstimate::first(Pose::identity()),
             odometry_from_vehicle: None,
+            time: TimestampNs(0),
             lanes: BTreeMap::new(),
             index: LaneIndex::default(),
             last_lane: 0,
@@ -113,8 +116,10 @@ impl Mapper {
     fn predict(&mut self, frame: &Frame) -> PoseEstimate {
         let odometry = frame.odometry();
         let previous = self.odometry_from_vehicle.replace(odometry.odometry_from_vehicle);
+        let seconds = frame.time().seconds_since(self.time);
+        self.time = frame.time();
         match previous {
-            Some(previous) => self.pose.predict(&previous, odometry, &self.params.tracking),
+            Some(previous) => self.pose.predict(&previous, odometry, seconds, &self.params.tracking),
             None => PoseEstimate::first(odometry.odometry_from_vehicle),
         }
     }
@@ -135,8 +140,8 @@ impl Mapper {
                 LaneShape::seen_once(observation.category, points, params.category_confusion)
             })
             .collect();
-        let sigma = |a: usize, b: usize| (predicted.covariance[(a, a)].max(predicted.covariance[(b, b)])).sqrt();
-        let uncertainty = PoseUncertainty { yaw_rad: sigma(5, 5), position_m: sigma(0, 1) };
+        let sigma = |axis: usize| predicted.covariance[(axis, axis)].max(0.0).sqrt();
+        let uncertainty = PoseUncertainty { yaw_rad: sigma(5), along_m: sigma(0), across_m: sigma(1) };
         match self.params.preset {
             Preset::Paper => {
                 let lane_of = associate_by_chamfer(&detections, &scene.shapes, &uncertainty, params, true);
@@ -213,7 +218,7 @@ impl Mapper {
         let pose = &self.pose.map_from_vehicle;
         let mut lane = Landmark::begin(id, observation, pose, time, &self.params)?;
         self.last_lane += 1;
-        Self::take_in(&mut lane, observation, time, pose, &self.sensor, &self.params);
+        Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, &self.sensor, &self.params);
         let (first, last) = lane.knots();
         self.index.update(id, lane.information(), first, last);
         self.lanes.insert(id, lane);

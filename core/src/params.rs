@@ -158,8 +158,16 @@ pub struct TrackingParams {
     pub frame_pitch_sigma_rad: f64,
     /// Noise of a single point, metres.
     pub point_sigma_m: f64,
-    /// Eigenvalues of the lanes' information below this share of the odometry's leave the direction to odometry.
+    /// Where the least spread of the lines' normals is below this share of the largest, that direction is left to odometry.
     pub weak_direction: f64,
+    /// Time over which the error of the pose that lanes show is correlated, seconds; 0: not at all (`paper`).
+    pub correlation_s: f64,
+    /// How much the variance of the map counts in a point's noise: frames that made it were not independent.
+    pub map_doubt: f64,
+    /// How much sharper the lanes are in one frame, once that error is in the state.
+    pub sharpness: f64,
+    /// Bound on the uncertainty along the road, relative to the map around the vehicle, metres.
+    pub map_memory_m: f64,
     /// Odometry noise where the vehicle gives none: translation per frame, metres.
     pub odometry_sigma_m: f64,
     /// Odometry noise where the vehicle gives none: rotation per frame, radians.
@@ -239,7 +247,12 @@ impl Params {
                 bound_noise_m: 0.5,
                 ..Self::mended().association
             },
-            tracking: TrackingParams { iterations: 10, point_step_m: 1.0, ..Self::mended().tracking },
+            tracking: TrackingParams {
+                iterations: 10,
+                point_step_m: 1.0,
+                correlation_s: 0.0,
+                ..Self::mended().tracking
+            },
             landmark: LandmarkParams {
                 chord_m: 3.0,
                 ends: EndRule::Open,
@@ -287,9 +300,9 @@ impl Params {
                 bound_noise_m: 0.5,
                 noise: RangeNoise { near_m: 0.15, growth_m: 0.5, reference_range_m: 50.0, exponent: 1.0 },
                 witnesses: 3.0,
-                unassigned_cost: 8.0,
+                unassigned_cost: 12.0,
                 missed_cost: 1.0,
-                gate_m: 1.5,
+                gate_m: 1.2,
                 gate_height_m: 2.0,
                 least_overlap_m: 5.0,
                 full_overlap_m: 20.0,
@@ -305,13 +318,17 @@ impl Params {
                 iterations: 4,
                 point_step_m: 3.0,
                 huber_sigmas: 2.0,
-                line_offset_sigma_m: 0.1,
+                line_offset_sigma_m: 0.2,
                 line_slope_sigma_rad: 0.004,
                 line_bend_sigma_m: 0.3,
                 frame_yaw_sigma_rad: 0.003,
                 frame_pitch_sigma_rad: 0.005,
                 point_sigma_m: 0.1,
-                weak_direction: 1e-3,
+                weak_direction: 0.05,
+                correlation_s: 0.5,
+                sharpness: 10.0,
+                map_doubt: 1.0,
+                map_memory_m: 1.0,
                 odometry_sigma_m: 0.02,
                 odometry_sigma_rad: 0.001,
             },

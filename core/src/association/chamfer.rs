@@ -26,7 +26,7 @@ pub struct Edge {
 #[must_use]
 pub fn distance_bound_m(point_vehicle: &Point3<f64>, pose: &PoseUncertainty, params: &AssociationParams) -> f64 {
     let turned = 2.0 * point_vehicle.coords.norm() * pose.yaw_rad.sin();
-    (turned + 2.0 * pose.position_m + 2.0 * params.bound_noise_m).max(params.least_bound_m)
+    (turned + 2.0 * pose.along_m.max(pose.across_m) + 2.0 * params.bound_noise_m).max(params.least_bound_m)
 }
 
 /// Bounded Chamfer distance from a detection to a lane, or `None` where it exceeds `sqrt(2) mean(delta)`.
@@ -136,7 +136,7 @@ mod tests {
     #[test]
     fn lines_of_other_categories_are_never_matched() {
         let params = Params::preset(Preset::Paper).association;
-        let pose = PoseUncertainty { yaw_rad: 0.03, position_m: 1.0 };
+        let pose = PoseUncertainty { yaw_rad: 0.03, along_m: 1.0, across_m: 1.0 };
         let lanes = [line(0.0, Category::WhiteDashed), line(3.5, Category::WhiteSolid)];
         let matched = associate_by_chamfer(&[line(0.4, Category::WhiteSolid)], &lanes, &pose, &params, true);
         assert_eq!(matched, vec![Some(1)]);

@@ -68,8 +68,8 @@ pub fn associate_jointly(
 ) -> JointAssociation {
     let nothing = Vector3::zeros();
     let sigma = Vector3::new(
-        pose.position_m.max(params.least_sigma_m),
-        pose.position_m.max(params.least_sigma_m),
+        pose.along_m.max(params.least_sigma_m),
+        pose.across_m.max(params.least_sigma_m),
         pose.yaw_rad.max(params.least_sigma_rad),
     );
     // How far the pose may push a line at mid range; below a third of a lane there is only one hypothesis.
@@ -339,7 +339,7 @@ mod tests {
         #[test]
         fn a_frame_displaced_by_more_than_a_lane_is_matched_and_its_error_found(dy in -5.0..5.0f64, dpsi in -0.07..0.07f64) {
             let params = Params::preset(Preset::Default).association;
-            let pose = PoseUncertainty { yaw_rad: 0.035, position_m: 3.0 };
+            let pose = PoseUncertainty { yaw_rad: 0.035, along_m: 3.0, across_m: 3.0 };
             let found = associate_jointly(&displaced(&road(), Vector3::new(0.0, dy, dpsi)), &road(), &pose, &params);
             prop_assert_eq!(found.lane_of, vec![Some(0), Some(1), Some(2), Some(3)]);
             prop_assert!((found.pose_error.y - dy).abs() < 0.5, "{} {}", found.pose_error.y, dy);
@@ -349,7 +349,7 @@ mod tests {
     #[test]
     fn a_flipped_category_does_not_split_a_lane() {
         let params = Params::preset(Preset::Default).association;
-        let pose = PoseUncertainty { yaw_rad: 0.001, position_m: 0.05 };
+        let pose = PoseUncertainty { yaw_rad: 0.001, along_m: 0.05, across_m: 0.05 };
         let mut detections = displaced(&road(), Vector3::new(0.0, 0.2, 0.0));
         detections[1].category = Category::WhiteSolid;
         let found = associate_jointly(&detections, &road(), &pose, &params);
@@ -359,7 +359,7 @@ mod tests {
     #[test]
     fn a_lane_between_two_lanes_is_new() {
         let params = Params::preset(Preset::Default).association;
-        let pose = PoseUncertainty { yaw_rad: 0.001, position_m: 0.05 };
+        let pose = PoseUncertainty { yaw_rad: 0.001, along_m: 0.05, across_m: 0.05 };
         let between = displaced(&road()[1..2], Vector3::new(0.0, 1.8, 0.0));
         assert_eq!(associate_jointly(&between, &road(), &pose, &params).lane_of, vec![None]);
     }

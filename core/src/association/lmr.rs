@@ -32,7 +32,7 @@ const METRES_PER_RADIAN: f64 = 5.0;
 ///     let points = (3..50).map(|x| Point3::new(f64::from(x), y, 0.0)).collect();
 ///     LaneShape::seen_once(Category::WhiteSolid, points, 0.1)
 /// };
-/// let pose = PoseUncertainty { yaw_rad: 0.03, position_m: 1.0 };
+/// let pose = PoseUncertainty { yaw_rad: 0.03, along_m: 1.0, across_m: 1.0 };
 /// let params = Params::preset(Preset::Paper).association;
 /// let matched = associate_by_lmr(&[line(0.3), line(3.8)], &[line(3.5), line(0.0)], &pose, &params, true);
 /// assert_eq!(matched, vec![Some(1), Some(0)]);

@@ -26,6 +26,8 @@ pub struct Extent {
 struct Stretch {
     seen: f32,
     absent: f32,
+    /// Sum of the inverse variances with which it was seen, 1/m^2.
+    information: f32,
 }
 
 impl Stretch {
@@ -74,7 +76,16 @@ impl Extent {
     /// Counts one frame's votes on the stretches between two parameters.
     ///
     /// `visibility` says how surely the detector would have reported the line at a parameter if it ran there, in `[0, 1]`.
-    pub fn vote(&mut self, sighting: &Sighting, from: f64, to: f64, visibility: impl Fn(f64) -> f64) {
+    ///
+    /// `variance` is that of the detection there, m^2.
+    pub fn vote(
+        &mut self,
+        sighting: &Sighting,
+        from: f64,
+        to: f64,
+        visibility: impl Fn(f64) -> f64,
+        variance: impl Fn(f64) -> f64,
+    ) {
         for stretch in stretch_of(from)..=stretch_of(to) {
             let parameter = middle_of(stretch);
             let share = sighting.share(parameter);
@@ -87,6 +98,9 @@ impl Extent {
             {
                 votes.seen += share as f32;
                 votes.absent += absent as f32;
+                if share > 0.0 {
+                    votes.information += (share / variance(parameter)) as f32;
+                }
             }
         }
     }
@@ -113,7 +127,16 @@ impl Extent {
             let mine = self.at_mut(stretch_of(to_mine(middle_of(stretch))));
             mine.seen += votes.seen;
             mine.absent += votes.absent;
+            mine.information += votes.information;
         }
+    }
+
+    /// Variance of the line's place as far as the frames that saw it were independent, m^2; infinite where none did.
+    #[must_use]
+    pub fn variance_at(&self, parameter: f64) -> f64 {
+        let index = usize::try_from(stretch_of(parameter) - self.first).ok();
+        let information = index.and_then(|index| self.stretches.get(index)).map_or(0.0, |stretch| stretch.information);
+        1.0 / f64::from(information)
     }
 
     /// First and last parameter of the line, by knot: the outermost stretches that more than `share` of their votes saw.
@@ -141,7 +164,7 @@ mod tests {
                 let shift = phase + f64::from(frame) * 0.37;
                 let rows_to_end = ((end - shift) / spacing).floor() * spacing + shift;
                 let sighting = Sighting { reported: (0.0, rows_to_end + spacing), certain: (0.0, rows_to_end) };
-                extent.vote(&sighting, 0.0, 20.0, |_| 1.0);
+                extent.vote(&sighting, 0.0, 20.0, |_| 1.0, |_| 1.0);
             }
             let (_, to) = extent.drawn(0.5).unwrap();
             prop_assert!((to - end).abs() < 0.4, "{to}");
@@ -151,9 +174,9 @@ mod tests {
     #[test]
     fn what_cannot_be_seen_is_not_voted_away() {
         let mut extent = Extent::default();
-        extent.vote(&Sighting { reported: (0.0, 12.0), certain: (0.0, 12.0) }, 0.0, 12.0, |_| 1.0);
+        extent.vote(&Sighting { reported: (0.0, 12.0), certain: (0.0, 12.0) }, 0.0, 12.0, |_| 1.0, |_| 1.0);
         for _ in 0..20 {
-            extent.vote(&Sighting { reported: (0.0, 5.0), certain: (0.0, 5.0) }, 0.0, 12.0, |_| 0.0);
+            extent.vote(&Sighting { reported: (0.0, 5.0), certain: (0.0, 5.0) }, 0.0, 12.0, |_| 0.0, |_| 1.0);
         }
         assert_eq!(extent.drawn(0.5), Some((0.0, 12.0)));
     }

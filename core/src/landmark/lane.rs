@@ -363,7 +363,12 @@ impl Landmark {
         let mut extent = std::mem::take(&mut self.extent);
         let curve = self.curve(params.ends);
         if let Some(curve) = curve {
-            extent.vote(&sighting, from, to, |parameter| visibility(&curve.point(parameter - head)));
+            let camera = map_from_vehicle.translation.vector;
+            let variance = |parameter: f64| {
+                let range_m = (curve.point(parameter - head).coords - camera).norm();
+                sigma_at(&params.noise, range_m).powi(2)
+            };
+            extent.vote(&sighting, from, to, |parameter| visibility(&curve.point(parameter - head)), variance);
         }
         self.extent = extent;
     }

@@ -101,7 +101,9 @@ fn correspondences(
         .map(|point| {
             let foot = walk.foot_point(&(pose * point))?;
             let tangent_map = curve.derivative(foot.parameter).try_normalize(1e-9)?;
-            Some(Correspondence { foot_map: curve.point(foot.parameter), tangent_map })
+            let head = lane.information().head() as f64;
+            let map_variance = lane.extent.variance_at(head + foot.parameter).min(10.0);
+            Some(Correspondence { foot_map: curve.point(foot.parameter), tangent_map, map_variance })
         })
         .collect()
 }

@@ -8,14 +8,14 @@
 //! `B a + white`, `B = [1, r, (r / r_0)^2]` in the range `r`, `a ~ N(0, S)`, sideways and in height. The `a` are eliminated in closed
 //! form (Woodbury): `H = J^T D J - J^T D B (S^-1 + B^T D B)^-1 B^T D J`. Yaw and pitch errors that all lines of a frame
 //! share are eliminated likewise. What the lanes hardly constrain (a straight road says nothing along itself) is left to
-//! odometry: directions whose share of the lanes' information, in units of the prior, is below a threshold are dropped.
+//! odometry: where the normals of all lines are nearly parallel, the direction square to them is projected out.
 
-use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+use nalgebra::{Matrix2, Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 use super::PoseEstimate;
 use crate::{
     geometry::{
-        Pose,
+        Pose, TangentCovariance,
         pose::{log, perturb},
     },
     params::TrackingParams,
@@ -28,6 +28,8 @@ pub struct Correspondence {
     pub foot_map: Point3<f64>,
     /// Unit tangent of the lane there, map frame.
     pub tangent_map: Vector3<f64>,
+    /// Variance of the lane there, m^2.
+    pub map_variance: f64,
 }
 
 /// A detection that was taken for a lane: its points, and how to find their foot points.
@@ -42,6 +44,9 @@ pub struct MatchedLane<'a> {
 const BEND_RANGE_M: f64 = 50.0;
 
 /// Corrects a predicted pose by the lanes matched in one frame, starting the search at `start`.
+///
+/// The lanes show the sum `s = x + c` of the pose and the detector's error (`prediction`); what is found of `s` is shared out by
+/// their covariances: with `G = P [I I]^T M^-1`, `M = [I I] P [I I]^T`, both move by `G (s - s_predicted)`.
 #[must_use]
 pub fn update_pose(
     predicted: &PoseEstimate,
@@ -49,14 +54,28 @@ pub fn update_pose(
     lanes: &[MatchedLane<'_>],
     params: &TrackingParams,
 ) -> PoseEstimate {
-    let Some(prior) = Prior::new(predicted) else { return *predicted };
-    let mut pose = *start;
+    let shown = perturb(&predicted.map_from_vehicle, &predicted.detector_error);
+    let start = perturb(start, &predicted.detector_error);
+    let with_fresh_error = refresh_detector_error(predicted, &Normal::lanes_at(lanes, &start, params).hessian, params);
+    let Some(prior) = Prior::new(&with_fresh_error, &shown) else { return *predicted };
+    let (found, found_covariance) = minimise(&prior, start, lanes, params);
+    share_out(&with_fresh_error, &prior, &found, &found_covariance)
+}
+
+/// Levenberg-Marquardt on the lanes and the prior; the minimum and its covariance.
+fn minimise(
+    prior: &Prior,
+    start: Pose,
+    lanes: &[MatchedLane<'_>],
+    params: &TrackingParams,
+) -> (Pose, TangentCovariance) {
+    let mut pose = start;
     let mut damping = 0.0;
-    let mut current = Normal::of(lanes, &pose, &prior, params);
+    let mut current = Normal::of(lanes, &pose, prior, params);
     for _ in 0..params.iterations {
         let Some(step) = current.step(damping) else { break };
         let moved = perturb(&pose, &step);
-        let next = Normal::of(lanes, &moved, &prior, params);
+        let next = Normal::of(lanes, &moved, prior, params);
         if next.cost > current.cost * (1.0 + 1e-9) {
             damping = (damping * 10.0f64).max(1e-3);
             continue;
@@ -68,28 +87,69 @@ pub fn update_pose(
             break;
         }
     }
-    let covariance = current.hessian.cholesky().map_or(predicted.covariance, |factor| factor.inverse());
-    PoseEstimate { map_from_vehicle: pose, covariance: (covariance + covariance.transpose()) * 0.5 }
+    (pose, current.hessian.cholesky().map_or(prior.covariance, |factor| factor.inverse()))
 }
 
-/// The odometry term.
+/// Brings the detector's error to its stationary covariance `C = H^-1` where the lanes say anything: `+ (1 - phi^2) C`.
+///
+/// What is left of the old covariance tells how much of it was forgotten.
+fn refresh_detector_error(predicted: &PoseEstimate, hessian: &Matrix6<f64>, params: &TrackingParams) -> PoseEstimate {
+    if params.correlation_s <= 0.0 {
+        return *predicted;
+    }
+    // Metres and radians are made alike at a lever of some car lengths.
+    let scale = Vector6::new(1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M);
+    let unit = Matrix6::from_diagonal(&scale.map(|s| 1.0 / s));
+    let eigen = (unit * hessian * unit).symmetric_eigen();
+    let mut stationary = Matrix6::zeros();
+    for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+        if *value > LEAST_INFORMATION {
+            stationary += vector * vector.transpose() / *value;
+        }
+    }
+    let stationary = unit * stationary * unit;
+    let fresh = 1.0 - predicted.remembered * predicted.remembered;
+    PoseEstimate { detector_covariance: predicted.detector_covariance + stationary * fresh, ..*predicted }
+}
+
+/// Lever at which a rotation is weighed against a translation, metres.
+const LEVER_M: f64 = 10.0;
+/// Directions of less information than this, 1/m^2, are not constrained by lanes at all.
+const LEAST_INFORMATION: f64 = 1.0;
+
+/// Shares a found sum out to the pose and the detector's error.
+fn share_out(predicted: &PoseEstimate, prior: &Prior, found: &Pose, found_covariance: &Matrix6<f64>) -> PoseEstimate {
+    let PoseEstimate { covariance, detector_covariance, cross_covariance: cross, .. } = predicted;
+    let pose_gain = (covariance + cross) * prior.information;
+    let error_gain = (detector_covariance + cross.transpose()) * prior.information;
+    let innovation = log(&(prior.predicted_from_map * found));
+    let gone = prior.covariance - found_covariance;
+    let symmetric = |matrix: Matrix6<f64>| (matrix + matrix.transpose()) * 0.5;
+    PoseEstimate {
+        map_from_vehicle: perturb(&predicted.map_from_vehicle, &(pose_gain * innovation)),
+        covariance: symmetric(covariance - pose_gain * gone * pose_gain.transpose()),
+        detector_error: predicted.detector_error + error_gain * innovation,
+        detector_covariance: symmetric(detector_covariance - error_gain * gone * error_gain.transpose()),
+        cross_covariance: cross - pose_gain * gone * error_gain.transpose(),
+        remembered: predicted.remembered,
+    }
+}
+
+/// What is believed of the sum `s` before the lanes are looked at.
 struct Prior {
     predicted_from_map: Pose,
-    /// `P = L L^T`.
-    root: Matrix6<f64>,
+    covariance: Matrix6<f64>,
     information: Matrix6<f64>,
 }
 
 impl Prior {
-    fn new(predicted: &PoseEstimate) -> Option<Self> {
+    fn new(predicted: &PoseEstimate, shown: &Pose) -> Option<Self> {
+        let cross = &predicted.cross_covariance;
+        let sum = predicted.covariance + predicted.detector_covariance + cross + cross.transpose();
         // A variance of nothing at all (a first frame, odometry that claims to be exact) still needs an inverse.
-        let floored = predicted.covariance + Matrix6::identity() * 1e-10;
-        let factor = floored.cholesky()?;
-        Some(Self {
-            predicted_from_map: predicted.map_from_vehicle.inverse(),
-            root: factor.l(),
-            information: factor.inverse(),
-        })
+        let covariance = (sum + sum.transpose()) * 0.5 + Matrix6::identity() * 1e-10;
+        let information = covariance.cholesky()?.inverse();
+        Some(Self { predicted_from_map: shown.inverse(), covariance, information })
     }
 }
 
@@ -101,10 +161,27 @@ struct Normal {
 }
 
 impl Normal {
+    /// The lanes and the prior.
     fn of(lanes: &[MatchedLane<'_>], pose: &Pose, prior: &Prior, params: &TrackingParams) -> Self {
+        let lanes = Self::lanes_at(lanes, pose, params);
+        // With the lines' common error in the state, what is left in a frame is white and small.
+        let sharpen = if params.correlation_s > 0.0 { params.sharpness } else { 1.0 };
+        let deviation = log(&(prior.predicted_from_map * pose));
+        let pull = prior.information * deviation;
+        Self {
+            hessian: lanes.hessian * sharpen + prior.information,
+            gradient: lanes.gradient * sharpen + pull,
+            cost: lanes.cost * sharpen + deviation.dot(&pull),
+        }
+    }
+
+    /// The lanes alone.
+    fn lanes_at(lanes: &[MatchedLane<'_>], pose: &Pose, params: &TrackingParams) -> Self {
         let (mut hessian, mut gradient, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
+        let mut normals = Matrix2::zeros();
         for lane in lanes {
             let feet = (lane.foot_points)(pose);
+            normals += normals_of(&feet, pose);
             for axis in [Axis::Lateral, Axis::Vertical] {
                 let sums = LineSums::of(axis, &lane.points_vehicle, &feet, pose, params);
                 let (h, g, c) = sums.without_line_error(axis, params);
@@ -114,10 +191,11 @@ impl Normal {
             }
         }
         let (hessian, gradient, cost) = without_shared_rotation(&hessian, &gradient, cost, params);
-        let (hessian, gradient) = without_weak_directions(&hessian, &gradient, prior, params);
-        let deviation = log(&(prior.predicted_from_map * pose));
-        let pull = prior.information * deviation;
-        Self { hessian: hessian + prior.information, gradient: gradient + pull, cost: cost + deviation.dot(&pull) }
+        let (hessian, gradient) = match weak_direction(&normals, params) {
+            Some(direction) => without_direction(&hessian, &gradient, &direction),
+            None => (hessian, gradient),
+        };
+        Self { hessian, gradient, cost }
     }
 
     fn step(&self, damping: f64) -> Option<Vector6<f64>> {
@@ -159,9 +237,9 @@ impl LineSums {
             be: Vector3::zeros(),
             ee: 0.0,
         };
-        let variance = params.point_sigma_m * params.point_sigma_m;
         for (point, foot) in points.iter().zip(feet) {
             let Some(foot) = foot else { continue };
+            let variance = params.point_sigma_m * params.point_sigma_m + params.map_doubt * foot.map_variance;
             let direction = across(axis, &foot.tangent_map);
             let residual = direction.dot(&(pose * point - foot.foot_map));
             let jacobian = residual_jacobian(pose, point, &direction);
@@ -243,26 +321,32 @@ fn without_shared_rotation(
     (hessian, gradient, cost)
 }
 
-/// Drops the directions in which the lanes say next to nothing, measured in units of the prior's uncertainty.
-fn without_weak_directions(
+/// The plan direction, in vehicle axes, about which the lanes say next to nothing: along a straight road.
+///
+/// The normals of all foot points are gathered; where their smallest spread is below a share of the largest, what is left
+/// of it is the wiggle of the map and of the detector, which moves along with the vehicle and would hold it back.
+fn weak_direction(normals: &Matrix2<f64>, params: &TrackingParams) -> Option<Vector6<f64>> {
+    let eigen = normals.symmetric_eigen();
+    let (least, most) = (eigen.eigenvalues.imin(), eigen.eigenvalues.imax());
+    let is_weak = eigen.eigenvalues[least] < params.weak_direction * eigen.eigenvalues[most];
+    let direction = eigen.eigenvectors.column(least);
+    is_weak.then(|| Vector6::new(direction[0], direction[1], 0.0, 0.0, 0.0, 0.0))
+}
+
+/// Scatter of the normals of some foot points, in plan, vehicle axes.
+fn normals_of(feet: &[Option<Correspondence>], pose: &Pose) -> Matrix2<f64> {
+    let normal = |foot: &Correspondence| (pose.rotation.inverse() * across(Axis::Lateral, &foot.tangent_map)).xy();
+    feet.iter().flatten().map(normal).map(|n| n * n.transpose()).sum()
+}
+
+/// Leaves a direction to odometry: `(I - v v^T) H (I - v v^T)`.
+fn without_direction(
     hessian: &Matrix6<f64>,
     gradient: &Vector6<f64>,
-    prior: &Prior,
-    params: &TrackingParams,
+    direction: &Vector6<f64>,
 ) -> (Matrix6<f64>, Vector6<f64>) {
-    let whitened = prior.root.transpose() * hessian * prior.root;
-    let eigen = whitened.symmetric_eigen();
-    let threshold = params.weak_direction * eigen.eigenvalues.max();
-    let Some(unwhiten) = prior.root.transpose().try_inverse() else { return (*hessian, *gradient) };
-    let pull = prior.root.transpose() * gradient;
-    let (mut kept, mut kept_pull) = (Matrix6::zeros(), Vector6::zeros());
-    for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
-        if *value > threshold {
-            kept += vector * vector.transpose() * *value;
-            kept_pull += vector * vector.dot(&pull);
-        }
-    }
-    (unwhiten * kept * unwhiten.transpose(), unwhiten * kept_pull)
+    let project = Matrix6::identity() - direction * direction.transpose();
+    (project * hessian * project, project * gradient)
 }
 
 #[cfg(test)]
@@ -313,7 +397,7 @@ mod tests {
         ) {
             let truth = exp(&Vector6::new(x, y, z, 0.0, 0.0, yaw));
             let covariance = covariance_from_sigmas([0.5, 0.5, 0.3], [1e-3, 1e-3, 0.02]);
-            let predicted = PoseEstimate { map_from_vehicle: Pose::identity(), covariance };
+            let predicted = PoseEstimate { covariance, ..PoseEstimate::first(Pose::identity()) };
             // Errors shared by the frame cannot be told from the vehicle's own: leave them out to see the geometry alone.
             let exact = TrackingParams { frame_yaw_sigma_rad: 0.0, frame_pitch_sigma_rad: 0.0, iterations: 20, ..params() };
             let found = update_pose(&predicted, &predicted.map_from_vehicle, &scene(&truth), &exact);
@@ -347,7 +431,13 @@ mod tests {
         let points: Vec<Point3<f64>> = (1..9).map(|k| Point3::new(5.0 * f64::from(k), 1.0, 0.0)).collect();
         let feet: Vec<Option<Correspondence>> = points
             .iter()
-            .map(|p| Some(Correspondence { foot_map: Point3::new(p.x, 0.9, 0.0), tangent_map: Vector3::x() }))
+            .map(|p| {
+                Some(Correspondence {
+                    foot_map: Point3::new(p.x, 0.9, 0.0),
+                    tangent_map: Vector3::x(),
+                    map_variance: 0.0,
+                })
+            })
             .collect();
         let (hessian, gradient, _) =
             LineSums::of(Axis::Lateral, &points, &feet, &pose, &params).without_line_error(Axis::Lateral, &params);

@@ -2,7 +2,7 @@
 
 A fenced block marked `sh` is run by bash and must succeed. One marked `sh background` is started, must bring up a server
 that is ready and serves lanes, and is stopped by Ctrl-C at the end, which must succeed as well. `tests/run` is left to
-the caller, who has just run it.
+the caller, who has just run it. The Python that README.md shows must be that of clients/python.
 """
 import json
 import os
@@ -20,6 +20,7 @@ SERVER = "http://127.0.0.1:8080"
 READY_WITHIN_S = 180
 BLOCK_WITHIN_S = 600
 STOPPED_WITHIN_S = 30
+SHOWN_PYTHON = ROOT / "clients/python/stream_drive.py"
 BLOCK = re.compile(r"^```sh( background)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -63,9 +64,12 @@ def interrupt(process):
 
 
 def main():
+    readme = (ROOT / "README.md").read_text()
+    if f"```python\n{SHOWN_PYTHON.read_text()}```" not in readme:
+        sys.exit(f"README.md does not show {SHOWN_PYTHON.relative_to(ROOT)} as it is")
     running = []
     try:
-        for background, commands in BLOCK.findall((ROOT / "README.md").read_text()):
+        for background, commands in BLOCK.findall(readme):
             if commands.strip() == "tests/run":
                 continue
             print(f"$ {commands.strip()}", flush=True)

@@ -13,6 +13,7 @@
 
 pub mod bounds;
 pub mod entity_tag;
+pub mod extents;
 pub mod features;
 mod items;
 pub mod line;
@@ -26,17 +27,21 @@ mod viewer;
 
 use axum::{
     Router,
+    extract::FromRef,
     http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header},
     middleware,
-    response::{IntoResponse, Response},
+    response::{IntoResponse, Redirect, Response},
     routing::get,
 };
 use metrics_exporter_prometheus::PrometheusHandle;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tower_http::{compression::CompressionLayer, cors::CorsLayer};
 
-use self::problem::{Problem, repeated};
+use self::{
+    extents::Extents,
+    problem::{Problem, repeated},
+};
 use crate::session::Sessions;
 
 /// What the HTTP handlers read.
@@ -52,6 +57,25 @@ pub struct ServeState {
     pub shutdown: CancellationToken,
 }
 
+/// State of the handlers: what they are given, and what they keep.
+#[derive(Clone)]
+struct Shared {
+    state: ServeState,
+    extents: Extents,
+}
+
+impl FromRef<Shared> for ServeState {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.state.clone()
+    }
+}
+
+impl FromRef<Shared> for Extents {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.extents.clone()
+    }
+}
+
 /// Every HTTP route of the service, and the answer to requests that no route takes.
 pub fn router(state: ServeState) -> Router {
     Router::new()
@@ -60,6 +84,7 @@ pub fn router(state: ServeState) -> Router {
         .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
         .route(items::PATH, get(items::items))
         .route("/viewer", get(viewer::page))
+        .route("/viewer/", get(|| async { Redirect::permanent("/viewer") }))
         .route("/viewer/{name}", get(viewer::file))
         .route("/healthz", get(operation::healthz))
         .route("/readyz", get(operation::readyz))
@@ -69,7 +94,7 @@ pub fn router(state: ServeState) -> Router {
         .layer(CompressionLayer::new())
         .layer(middleware::from_fn(entity_tag::tell_compressed_apart))
         .layer(CorsLayer::permissive().expose_headers([header::ETAG]))
-        .with_state(state)
+        .with_state(Shared { state, extents: Extents::default() })
 }
 
 /// HTTP status and a problem document for HTTP; for gRPC, which reads trailers only, its own "unimplemented".
@@ -91,8 +116,13 @@ async fn method_not_allowed(method: Method) -> Problem {
     Problem::MethodNotAllowed { method }
 }
 
+/// Most answers that are made at a time; more wait, so that many readers of large maps cost no more memory than these.
+const MOST_AT_A_TIME: usize = 16;
+static PLACES: Semaphore = Semaphore::const_new(MOST_AT_A_TIME);
+
 /// Runs work that takes milliseconds where it delays no other request.
 async fn in_background<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Problem> {
+    let _place = PLACES.acquire().await.map_err(|_| Problem::Internal)?;
     tokio::task::spawn_blocking(work).await.map_err(|error| {
         tracing::error!(%error, "an answer could not be made");
         Problem::Internal

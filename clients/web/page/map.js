@@ -238,7 +238,7 @@ export class LaneMap {
     }
     const content = document.createElement("div");
     content.append(title, table);
-    new maplibre.Popup({ maxWidth: "320px" }).setLngLat(lngLat).setDOMContent(content).addTo(this.#map);
+    new maplibre.Popup({ maxWidth: "320px", padding: this.#padding() }).setLngLat(lngLat).setDOMContent(content).addTo(this.#map);
   }
 }
 

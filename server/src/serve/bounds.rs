@@ -57,7 +57,7 @@ impl Bounds {
     /// The box around points of a map frame; `None` without points.
     ///
     /// The box is taken in metres and its border carried to the earth, so that it costs 9 conversions however many
-    /// points there are. Not guaranteed: to enclose its corners to better than some metres once it is 50 km wide.
+    /// points there are. Not guaranteed: to enclose them exactly ([`Bounds::loosened`] does).
     #[must_use]
     pub fn around(georeference: &Georeference, points_map: impl Iterator<Item = Point3<f64>>) -> Option<Self> {
         let [low, high] = extent(points_map.map(|point| georeference.enu_from_map * point))?;
@@ -84,9 +84,17 @@ impl Bounds {
         Some(Self { west: wrapped(west), south, east: wrapped(east), north, heights: None })
     }
 
-    /// This box, `degrees` wider on each side.
+    /// A box that surely holds the lanes whose control points this box is [`Bounds::around`].
+    ///
+    /// A spline swings out of its control points by decimetres, and a wide box bulges on the earth by metres where only
+    /// its corners and middles were converted: a metre and a hundredth of its size cover both, to 1,000 km.
     #[must_use]
-    pub fn widened(self, degrees: f64) -> Self {
+    pub fn loosened(self) -> Self {
+        let size_deg = (self.north - self.south) + (self.east - self.west).rem_euclid(360.0);
+        self.widened(1e-5 + 0.01 * size_deg)
+    }
+
+    fn widened(self, degrees: f64) -> Self {
         let [west, east] = [self.west - degrees, self.east + degrees].map(|longitude| {
             if longitude.abs() > 180.0 { longitude - 360.0_f64.copysign(longitude) } else { longitude }
         });
@@ -200,14 +208,17 @@ mod tests {
     }
 
     #[test]
-    fn the_box_around_points_encloses_each_of_them() {
-        let georeference = georeference(-179.9999, 48.0);
-        let points: Vec<_> = (0..50).map(|i| Point3::new(f64::from(i) * 9.0, f64::from(i % 7) * 3.0, 0.0)).collect();
-        let bounds = Bounds::around(&georeference, points.iter().copied()).unwrap().widened(1e-6);
-        assert!(bounds.west > bounds.east, "it runs over the antimeridian");
-        for point in &points {
-            let place = on_the_earth(&georeference, point);
-            assert!(bounds.is_entered_by(&[place, place]), "{place:?} in {bounds:?}");
+    fn the_loosened_box_around_points_encloses_each_of_them_over_the_antimeridian_and_over_100_km() {
+        for step_m in [9.0, 2_000.0] {
+            let georeference = georeference(-179.9999, 48.0);
+            let points: Vec<_> =
+                (0..50).map(|i| Point3::new(f64::from(i) * step_m, f64::from(i % 7) * 3.0, 0.0)).collect();
+            let bounds = Bounds::around(&georeference, points.iter().copied()).unwrap().loosened();
+            assert!(bounds.west > bounds.east, "it runs over the antimeridian");
+            for point in &points {
+                let place = on_the_earth(&georeference, point);
+                assert!(bounds.is_entered_by(&[place, place]), "{place:?} in {bounds:?}");
+            }
         }
     }
 }

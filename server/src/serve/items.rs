@@ -17,6 +17,7 @@ use super::{
     ServeState,
     bounds::Bounds,
     entity_tag::EntityTag,
+    extents::Extents,
     features::{Crs, LaneFeature, feature},
     in_background,
     problem::Problem,
@@ -33,8 +34,6 @@ const DEFAULT_LIMIT: usize = 1_000;
 const MOST_LANES: usize = 10_000;
 /// Most coordinates of a page; the lane that reaches it is the page's last.
 const MOST_COORDINATES: usize = 200_000;
-/// Width that a lane's box from its control points needs to enclose the lane, degrees: a spline swings out by decimetres.
-const SWING_DEG: f64 = 1e-5;
 
 /// The last lane of a page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -81,7 +80,12 @@ impl PageQuery {
 }
 
 /// `GET /collections/lanes/items`
-pub(super) async fn items(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+pub(super) async fn items(
+    State(state): State<ServeState>,
+    State(extents): State<Extents>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
     let query = PageQuery::read(&uri)?;
     let maps = state.sessions.list();
     let asked = uri.query().unwrap_or_default().to_owned();
@@ -89,17 +93,17 @@ pub(super) async fn items(State(state): State<ServeState>, uri: Uri, headers: He
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let body = in_background(move || serde_json::to_vec(&page(&maps, &query, &asked))).await?;
+    let body = in_background(move || serde_json::to_vec(&page(&maps, &extents, &query, &asked))).await?;
     let body = body.map_err(|_| Problem::Internal)?;
     Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
 }
 
 /// The page that a query asks for; `asked` is the query as it was written.
-fn page(maps: &[Arc<PublishedMap>], query: &PageQuery, asked: &str) -> Page {
+fn page(maps: &[Arc<PublishedMap>], extents: &Extents, query: &PageQuery, asked: &str) -> Page {
     let mut features = Vec::new();
     let mut coordinates = 0;
     let mut more = false;
-    for (map, lane) in candidates(maps, query) {
+    for (map, lane) in candidates(maps, extents, query) {
         let Some(found) = feature(map, lane, Crs::Wgs84) else { continue };
         if query.bounds.is_some_and(|bounds| !found.geometry.enters(&bounds)) {
             continue;
@@ -117,27 +121,30 @@ fn page(maps: &[Arc<PublishedMap>], query: &PageQuery, asked: &str) -> Page {
 /// The lanes after the cursor, by session and number, that may enter the box.
 fn candidates<'a>(
     maps: &'a [Arc<PublishedMap>],
+    extents: &'a Extents,
     query: &'a PageQuery,
 ) -> impl Iterator<Item = (&'a PublishedMap, &'a MapLane)> {
-    let lanes_of = |map: &'a Arc<PublishedMap>| map.map.lanes.iter().map(move |lane| (map.as_ref(), lane));
     maps.iter()
-        .filter(move |map| {
-            map.georeference.is_some() && query.after_exclusive.is_none_or(|after| map.session >= after.session)
-        })
-        .flat_map(lanes_of)
-        .filter(move |(map, lane)| {
+        .map(Arc::as_ref)
+        .filter(|map| map.georeference.is_some())
+        .filter(|map| query.after_exclusive.is_none_or(|after| map.session >= after.session))
+        .filter(move |map| may_touch(query.bounds, || extents.of(map)))
+        .flat_map(|map| map.map.lanes.iter().map(move |lane| (map, lane)))
+        .filter(|(map, lane)| {
             query.after_exclusive.is_none_or(|after| Cursor { session: map.session, lane: lane.id.0 } > after)
-                && query.bounds.is_none_or(|bounds| may_enter(map, lane, &bounds))
         })
+        .filter(move |(map, lane)| may_touch(query.bounds, || around(map, lane)))
 }
 
-/// Whether the box around a lane's control points touches `bounds`: cheap, and never wrong where it says no.
-fn may_enter(map: &PublishedMap, lane: &MapLane, bounds: &Bounds) -> bool {
+/// Whether what lies within the box `around` it may enter `bounds`; never wrong where it says no.
+fn may_touch(bounds: Option<Bounds>, around: impl FnOnce() -> Option<Bounds>) -> bool {
+    bounds.is_none_or(|bounds| around().is_some_and(|around| around.loosened().touches(&bounds)))
+}
+
+/// The box around a lane's control points.
+fn around(map: &PublishedMap, lane: &MapLane) -> Option<Bounds> {
     let points = lane.control_points.iter().map(|point| point.position);
-    map.georeference
-        .as_ref()
-        .and_then(|georeference| Bounds::around(georeference, points))
-        .is_some_and(|around| around.widened(SWING_DEG).touches(bounds))
+    Bounds::around(map.georeference.as_ref()?, points)
 }
 
 fn links(asked: &str, last: Option<&LaneFeature>) -> Vec<Link> {
@@ -175,7 +182,7 @@ mod tests {
 
     fn ask(query: &str) -> Page {
         let uri = format!("{PATH}?{query}").parse().unwrap();
-        page(&three_sessions(), &PageQuery::read(&uri).unwrap(), query)
+        page(&three_sessions(), &Extents::default(), &PageQuery::read(&uri).unwrap(), query)
     }
 
     #[test]

@@ -15,8 +15,9 @@ use serde::Serialize;
 
 use super::{
     ServeState,
-    bounds::{Bounds, extent},
+    bounds::extent,
     entity_tag::EntityTag,
+    extents::Extents,
     features::{Crs, rfc3339, session_lanes},
     in_background,
     line::{Coordinate, in_metres, rounded, written},
@@ -86,7 +87,12 @@ struct Vehicle {
 }
 
 /// `GET /sessions`
-pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+pub(super) async fn list(
+    State(state): State<ServeState>,
+    State(extents): State<Extents>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
     let parameters = Parameters::read(&uri, &["limit", "after"])?;
     let limit = parameters.get("limit", |text| parse_limit(text, MOST_SESSIONS))?.unwrap_or(DEFAULT_LIMIT);
     let after = parameters.get("after", |text| text.parse::<SessionId>().map_err(|error| error.to_string()))?;
@@ -103,7 +109,7 @@ pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: Hea
         return Ok(tag.not_modified());
     }
     let page = in_background(move || {
-        let sessions: Vec<_> = maps.iter().map(|map| entry(map)).collect();
+        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents)).collect();
         let last = sessions.last().filter(|_| more);
         let next = last.map(|last| Link {
             rel: "next",
@@ -120,7 +126,7 @@ pub(super) fn identity(map: &PublishedMap) -> (u64, u64, bool) {
     (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
 }
 
-fn entry(map: &PublishedMap) -> Entry {
+fn entry(map: &PublishedMap, extents: &Extents) -> Entry {
     let path = format!("/sessions/{}", map.session);
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
@@ -139,22 +145,21 @@ fn entry(map: &PublishedMap) -> Entry {
         frames: map.version.0,
         georeferenced: map.georeference.is_some(),
         last_frame_at: map.last_sequence.map(|_| rfc3339(map.last_time)),
-        bbox: border(map),
+        bbox: border(map, extents),
         vehicle: map.last_sequence.map(|_| vehicle(map)),
         links,
     }
 }
 
-fn control_points(lanes: &LaneMap) -> impl Iterator<Item = Point3<f64>> {
+pub(super) fn control_points(lanes: &LaneMap) -> impl Iterator<Item = Point3<f64>> {
     lanes.lanes.iter().flat_map(|lane| lane.control_points.iter().map(|point| point.position))
 }
 
-fn border(map: &PublishedMap) -> Option<[f64; 4]> {
-    let points = control_points(&map.map);
-    if let Some(georeference) = &map.georeference {
-        return Bounds::around(georeference, points).map(|bounds| bounds.to_array());
+fn border(map: &PublishedMap, extents: &Extents) -> Option<[f64; 4]> {
+    if map.georeference.is_some() {
+        return extents.of(map).map(|bounds| bounds.to_array());
     }
-    let [low, high] = extent(points)?.map(|corner| in_metres(&corner));
+    let [low, high] = extent(control_points(&map.map))?.map(|corner| in_metres(&corner));
     Some([low[0], low[1], high[0], high[1]])
 }
 
@@ -250,10 +255,10 @@ mod tests {
     #[test]
     fn an_entry_of_the_list_has_the_border_of_its_lanes() {
         let mut map = published(1, 2);
-        let local = border(&map).unwrap();
+        let local = border(&map, &Extents::default()).unwrap();
         assert!(local[0].abs() < 1e-9 && local[2] > 50.0, "{local:?}");
         map.georeference = Some(georeference(11.58, 48.14));
-        let [west, south, east, north] = border(&map).unwrap();
+        let [west, south, east, north] = border(&map, &Extents::default()).unwrap();
         assert!(west < east && east <= 11.58 && (48.14..48.141).contains(&north) && south < north);
     }
 
@@ -261,7 +266,7 @@ mod tests {
     fn a_session_that_has_seen_no_frame_has_neither_border_nor_vehicle() {
         let mut map = published(1, 0);
         map.last_sequence = None;
-        let entry = serde_json::to_value(entry(&map)).unwrap();
+        let entry = serde_json::to_value(entry(&map, &Extents::default())).unwrap();
         assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
         assert_eq!(entry["state"], "live");
     }

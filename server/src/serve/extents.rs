@@ -1,0 +1,63 @@
+//! The border of each session's lanes on the earth, computed once per version of its map.
+//!
+//! A store holds many drives that are over and few that are live. A query for a box must not walk every control point of
+//! all of them: it asks for their borders here, and walks only the drives that the box touches.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use super::{bounds::Bounds, sessions::control_points};
+use crate::session::{MapVersion, PublishedMap, SessionId};
+
+/// The borders that are known. Clones share them; there is one per session, and the registry bounds the sessions.
+#[derive(Clone, Debug, Default)]
+pub struct Extents {
+    known: Arc<Mutex<BTreeMap<SessionId, Known>>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Known {
+    version: MapVersion,
+    bounds: Option<Bounds>,
+}
+
+impl Extents {
+    /// The border of a map's lanes; `None` without lanes, or without a place on the earth.
+    #[must_use]
+    pub fn of(&self, map: &PublishedMap) -> Option<Bounds> {
+        let georeference = map.georeference.as_ref()?;
+        let known = self.lock().get(&map.session).copied();
+        if let Some(known) = known.filter(|known| known.version == map.version) {
+            return known.bounds;
+        }
+        let bounds = Bounds::around(georeference, control_points(&map.map));
+        self.lock().insert(map.session, Known { version: map.version, bounds });
+        bounds
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<SessionId, Known>> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::serve::sample::{georeference, published};
+    use lanemap_core::LaneMap;
+
+    #[test]
+    fn a_border_is_that_of_the_newest_version_and_goes_with_the_place_on_the_earth() {
+        let extents = Extents::default();
+        let mut map = published(1, 3);
+        assert_eq!(extents.of(&map), None);
+        map.georeference = Some(georeference(11.58, 48.14));
+        let three_lanes = extents.of(&map).unwrap();
+        map.version = MapVersion(map.version.0 + 1);
+        map.map = Arc::new(LaneMap { lanes: map.map.lanes[..1].to_vec() });
+        let one_lane = extents.of(&map).unwrap();
+        assert!(one_lane.west > three_lanes.west, "lanes lie side by side, to the west");
+    }
+}

@@ -13,6 +13,7 @@ use std::path::Path;
 use lanemap_core::{Frame, Sequence};
 use thiserror::Error;
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 
 use crate::session::SessionId;
 pub use committer::CommitterThread;
@@ -70,6 +71,7 @@ pub fn frame_bytes(frame: &Frame) -> Result<Vec<u8>, JournalError> {
 pub struct Journal {
     store: Store,
     commits: mpsc::Sender<Commit>,
+    failed: CancellationToken,
 }
 
 impl Journal {
@@ -80,8 +82,9 @@ impl Journal {
     pub fn open(folder: &Path, max_frames_per_commit: usize) -> Result<(Self, CommitterThread), JournalError> {
         let store = Store::open(folder)?;
         let (commits, waiting) = mpsc::channel(WAITING_COMMITS);
-        let thread = Committer::new(store.clone(), waiting, max_frames_per_commit).start()?;
-        Ok((Self { store, commits }, thread))
+        let failed = CancellationToken::new();
+        let thread = Committer::new(store.clone(), waiting, max_frames_per_commit, failed.clone()).start()?;
+        Ok((Self { store, commits, failed }, thread))
     }
 
     /// Makes frames of one session durable; they are on the disk when this returns.
@@ -111,6 +114,12 @@ impl Journal {
         bytes: Vec<u8>,
     ) -> Result<(), JournalError> {
         self.commit(|done| Commit::Snapshot { session, covered, bytes, done }).await
+    }
+
+    /// Cancelled once a commit has failed: the store takes no more writes until it is opened anew.
+    #[must_use]
+    pub fn failed(&self) -> CancellationToken {
+        self.failed.clone()
     }
 
     async fn commit(

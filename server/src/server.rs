@@ -84,6 +84,7 @@ impl Server {
         let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
         let (journal, committer) = Journal::open(&config.data_dir, config.max_frames_per_commit).map_err(in_store)?;
         let (sessions, shutdown) = (Sessions::default(), CancellationToken::new());
+        let journal_failed = journal.failed();
         let surroundings = Surroundings {
             config: Arc::clone(&config),
             journal,
@@ -102,7 +103,8 @@ impl Server {
         let ingest = IngestGrpc::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
         let (health, router) = router(&config, ingest, http).await?;
 
-        let running = Running { config, registry, streams, ready, health, shutdown: shutdown.clone(), committer };
+        let running =
+            Running { config, registry, streams, ready, health, shutdown: shutdown.clone(), journal_failed, committer };
         let task = tokio::spawn(running.run(listener, router));
         tracing::info!(%address, "serving gRPC and HTTP");
         Ok(RunningServer { address, sessions, shutdown, task })
@@ -162,10 +164,17 @@ struct Running {
     ready: watch::Sender<bool>,
     health: HealthReporter,
     shutdown: CancellationToken,
+    journal_failed: CancellationToken,
     committer: CommitterThread,
 }
 
 impl Running {
+    async fn turn_unready(&self) {
+        self.ready.send_replace(false);
+        self.health.set_service_status("", ServingStatus::NotServing).await;
+        self.health.set_not_serving::<IngestServiceServer<IngestGrpc>>().await;
+    }
+
     async fn run(self, listener: TcpListener, router: Router) {
         let stop_listening = CancellationToken::new();
         let grace = self.config.shutdown_grace();
@@ -186,12 +195,17 @@ impl Running {
                 telemetry::metrics_handle().run_upkeep();
             }
         });
-        self.shutdown.cancelled().await;
+        tokio::select! {
+            () = self.shutdown.cancelled() => {}
+            () = self.journal_failed.cancelled() => {
+                self.turn_unready().await;
+                // Maps stay readable; whoever watches readiness restarts the service, which opens the store anew.
+                self.shutdown.cancelled().await;
+            }
+        }
 
         tracing::info!("shutting down");
-        self.ready.send_replace(false);
-        self.health.set_service_status("", ServingStatus::NotServing).await;
-        self.health.set_not_serving::<IngestServiceServer<IngestGrpc>>().await;
+        self.turn_unready().await;
         self.streams.close();
         let sessions_left = async {
             self.streams.wait().await;

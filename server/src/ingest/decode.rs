@@ -245,10 +245,14 @@ fn at_most(count: usize, limit: usize, field: impl FnOnce() -> String) -> Result
 
 #[cfg(test)]
 mod tests {
+    use lanemap_core::{Category, geometry::TangentCovariance};
     use lanemap_proto::encode;
     use nalgebra::{Translation3, UnitQuaternion};
+    use proptest::prelude::*;
+    use prost::Message;
 
     use super::*;
+    use crate::journal::frame_bytes;
 
     fn mount() -> Pose {
         Pose::from_parts(Translation3::new(1.5, 0.1, 1.4), UnitQuaternion::from_euler_angles(0.0, 0.02, 0.01))
@@ -286,6 +290,58 @@ mod tests {
 
     fn refusal(xyz: Vec<f64>) -> String {
         frame(&message(xyz), &PointFrame::Vehicle, &FrameLimits::default()).unwrap_err().to_string()
+    }
+
+    fn any_frame() -> impl Strategy<Value = Frame> {
+        let number = -400.0..400.0f64;
+        let point = prop::array::uniform3(number.clone()).prop_map(Point3::from);
+        let category = prop::sample::select(&Category::ALL[..]);
+        let detection = (category, prop::collection::vec(point, 2..9))
+            .prop_map(|(category, points_vehicle)| Detection { category, points_vehicle });
+        let fix = (-90.0..90.0f64, -180.0..180.0f64, number.clone(), prop::option::of(-3.0..3.0f64)).prop_map(
+            |(latitude_deg, longitude_deg, height_m, yaw_enu_rad)| GnssFix {
+                latitude_deg,
+                longitude_deg,
+                height_m,
+                horizontal_sigma_m: 0.7,
+                vertical_sigma_m: 1.3,
+                yaw_enu_rad,
+            },
+        );
+        let pose = (prop::array::uniform3(number), prop::array::uniform3(-3.0..3.0f64)).prop_map(|(t, r)| {
+            Pose::from_parts(Translation3::new(t[0], t[1], t[2]), UnitQuaternion::from_scaled_axis(r.into()))
+        });
+        let variances = prop::option::of(prop::array::uniform6(0.0..1.0f64));
+        let detections = prop::collection::vec(detection, 0..5);
+        (any::<u64>(), any::<i64>(), pose, variances, prop::option::of(fix), detections).prop_map(
+            |(sequence, time, odometry_from_vehicle, variances, gnss, detections)| {
+                let motion_covariance = variances.map(|v| TangentCovariance::from_diagonal(&v.into()));
+                let odometry = Odometry { odometry_from_vehicle, motion_covariance };
+                let (sequence, time) = (Sequence(sequence), TimestampNs(time));
+                let parts = FrameParts { sequence, time, odometry, gnss, detections };
+                Frame::new(parts, &FrameLimits::default()).unwrap()
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn a_frame_crosses_the_wire_bit_by_bit(frame in any_frame()) {
+            let bytes = encode::frame(&frame).encode_to_vec();
+            let message = v1::Frame::decode(bytes.as_slice()).unwrap();
+            let decoded = super::frame(&message, &PointFrame::Vehicle, &FrameLimits::default()).unwrap();
+            prop_assert_eq!(frame_bytes(&decoded).unwrap(), frame_bytes(&frame).unwrap());
+        }
+
+        #[test]
+        fn no_bytes_panic_the_decoder(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+            if let Ok(message) = v1::Frame::decode(bytes.as_slice()) {
+                let _ = super::frame(&message, &PointFrame::Vehicle, &FrameLimits::default());
+            }
+            if let Ok(message) = v1::SessionStart::decode(bytes.as_slice()) {
+                let _ = start(&message);
+            }
+        }
     }
 
     #[test]

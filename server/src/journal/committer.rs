@@ -4,6 +4,7 @@ use std::{thread, time::Instant};
 
 use lanemap_core::Sequence;
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 
 use super::{JournalError, JournalFrame, SessionRecord, store::Store, store::StoreBatch};
 use crate::{session::SessionId, telemetry};
@@ -27,6 +28,7 @@ pub(super) struct Committer {
     store: Store,
     waiting: mpsc::Receiver<Commit>,
     max_frames: usize,
+    failed: CancellationToken,
 }
 
 /// The committing thread; it ends once every handle to the journal is dropped and all that was waiting is durable.
@@ -44,8 +46,13 @@ impl CommitterThread {
 }
 
 impl Committer {
-    pub(super) fn new(store: Store, waiting: mpsc::Receiver<Commit>, max_frames: usize) -> Self {
-        Self { store, waiting, max_frames }
+    pub(super) fn new(
+        store: Store,
+        waiting: mpsc::Receiver<Commit>,
+        max_frames: usize,
+        failed: CancellationToken,
+    ) -> Self {
+        Self { store, waiting, max_frames, failed }
     }
 
     pub(super) fn start(self) -> Result<CommitterThread, JournalError> {
@@ -68,6 +75,7 @@ impl Committer {
             metrics::histogram!(telemetry::COMMIT_FRAMES).record(frames as f64);
             if let Err(error) = &outcome {
                 tracing::error!(%error, "the journal cannot commit: nothing is acked any more");
+                self.failed.cancel();
             }
             for done in done {
                 // A session that ended meanwhile does not ask for the outcome.

@@ -282,11 +282,14 @@ impl Actor {
         }
         self.surroundings.journal.append(self.record.id, journal).await?;
         self.ack();
+        for (_, arrived) in &frames {
+            metrics::histogram!(telemetry::ACK_SECONDS).record(arrived.elapsed().as_secs_f64());
+        }
         metrics::counter!(telemetry::FRAMES_ACKED).increment(frames.len() as u64);
         self.frames_since_snapshot += frames.len() as u64;
         for some in frames.chunks(STEPS_IN_A_ROW) {
-            for (frame, arrived) in some {
-                self.map(frame, *arrived);
+            for (frame, _) in some {
+                self.map(frame);
             }
             tokio::task::yield_now().await;
         }
@@ -302,8 +305,7 @@ impl Actor {
         }
     }
 
-    fn map(&mut self, frame: &Frame, arrived: Instant) {
-        metrics::histogram!(telemetry::ACK_SECONDS).record(arrived.elapsed().as_secs_f64());
+    fn map(&mut self, frame: &Frame) {
         let started = Instant::now();
         let report = self.drive.map(frame);
         metrics::histogram!(telemetry::STEP_SECONDS).record(started.elapsed().as_secs_f64());

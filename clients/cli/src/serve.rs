@@ -70,7 +70,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "S")]
     keep_alive_s: Option<u64>,
     /// Time that a shutdown gives open streams and connections to end, seconds
-    /// [env: LANEMAP_SHUTDOWN_GRACE_S] [default: 8]
+    /// [env: LANEMAP_SHUTDOWN_GRACE_S] [default: 6]
     #[arg(long, value_name = "S")]
     shutdown_grace_s: Option<u64>,
 }

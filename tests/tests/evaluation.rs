@@ -10,14 +10,14 @@ use std::{
 
 use lanemap_core::evaluation::{Counts, score_authors, score_strict};
 use lanemap_openlane::Drives;
-use lanemap_simulator::{Scenario, Simulation, openlane::write_simulation};
+use lanemap_simulator::{Scenario, openlane::write_simulation};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 fn recorded(seed: u64, length_m: f64) -> TempDir {
     let scenario = Scenario::long_road(seed, length_m);
     let folder = tempfile::tempdir().unwrap();
-    write_simulation(folder.path(), &scenario, &Simulation::run(&scenario)).unwrap();
+    write_simulation(folder.path(), &scenario).unwrap();
     folder
 }
 

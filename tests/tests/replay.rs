@@ -12,7 +12,7 @@ use std::{
 use lanemap_client::MapClient;
 use lanemap_core::{Frame, FrameLimits, LaneMap, Mapper, Params, Preset, Sequence};
 use lanemap_openlane::Drives;
-use lanemap_simulator::{OdometryNoise, Scenario, Simulation, openlane::write_simulation};
+use lanemap_simulator::{OdometryNoise, Scenario, openlane::write_simulation};
 use lanemap_tests::{folders::files, servers};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -21,7 +21,7 @@ use tempfile::TempDir;
 fn recorded(seed: u64, drives: u32, length_m: f64) -> TempDir {
     let scenario = Scenario { drives, ..Scenario::long_road(seed, length_m) };
     let folder = tempfile::tempdir().unwrap();
-    write_simulation(folder.path(), &scenario, &Simulation::run(&scenario)).unwrap();
+    write_simulation(folder.path(), &scenario).unwrap();
     folder
 }
 

@@ -72,10 +72,10 @@ fn gnss_poses_are_off_by_the_bias_of_their_drive() {
 }
 
 #[test]
-fn a_simulation_too_large_for_memory_is_refused_with_the_limit() {
+fn a_simulation_too_large_for_a_disk_is_refused_with_the_limit() {
     let folder = tempfile::tempdir().unwrap();
     let output = simulate(folder.path(), &["--drives", "1000", "--length-km", "50"]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("500"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("more than 1000"));
     assert!(files(folder.path()).is_empty());
 }

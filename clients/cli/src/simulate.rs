@@ -5,11 +5,11 @@ use std::{path::PathBuf, process::ExitCode};
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use lanemap_simulator::{
-    OdometryNoise, Scenario, Seed, Simulation, drive::MotionModel, openlane::write_simulation, road::NetworkPlan,
+    OdometryNoise, Scenario, Seed, drive::MotionModel, openlane::write_simulation, road::NetworkPlan,
 };
 
-/// Longest road of one simulation, km: frames are held in memory while they are written.
-const MAX_TOTAL_KM: f64 = 500.0;
+/// Longest way of one simulation, km: about 15 GB of files.
+const MAX_TOTAL_KM: f64 = 1_000.0;
 
 /// What to simulate.
 #[derive(Args, Debug)]
@@ -64,14 +64,13 @@ fn not_negative(text: &str) -> Result<f64, String> {
 /// Simulates and writes.
 pub fn run(args: &SimulateArgs) -> anyhow::Result<ExitCode> {
     let scenario = scenario(args)?;
-    let simulation = Simulation::run(&scenario);
-    write_simulation(&args.out, &scenario, &simulation)
+    let written = write_simulation(&args.out, &scenario)
         .context("the simulation cannot be written; --out must name a folder that can be made")?;
-    let frames: usize = simulation.drives.iter().map(|drive| drive.frames.len()).sum();
-    let length_km: f64 = simulation.drives.iter().map(|drive| drive.length_m() / 1e3).sum();
     println!(
-        "{} drives, {frames} frames, {length_km:.2} km, seed {} in {}",
-        simulation.drives.len(),
+        "{} drives, {} frames, {:.2} km, seed {} in {}",
+        written.drives,
+        written.frames,
+        written.length_m / 1e3,
         args.seed,
         args.out.display()
     );

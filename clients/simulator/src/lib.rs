@@ -2,7 +2,7 @@
 //!
 //! [`Simulation::run`] builds a [`road::RoadNetwork`] (hills, curves, junctions, splits and merges), drives through it
 //! and lets a [`detector::Detector`] watch. A [`SimulatedDrive`] holds the truth, and gives the frames that a vehicle
-//! would stream; [`openlane`] writes it all as `OpenLane` folders. Each model stands in a file of its own, with its
+//! would stream; a [`DriveSimulation`] gives them one by one; [`openlane`] writes it all as `OpenLane` folders. Each model stands in a file of its own, with its
 //! equations and figures.
 //!
 //! ```
@@ -29,7 +29,7 @@ pub mod view;
 pub use camera::Camera;
 pub use odometry::OdometryNoise;
 pub use random::Seed;
-pub use simulation::{Scenario, SimulatedDrive, SimulatedFrame, Simulation};
+pub use simulation::{DriveSimulation, Scenario, SimulatedDrive, SimulatedFrame, Simulation};
 
 /// A count from a finite number that is not negative, cut to whole; anything else is 0.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, and NaN becomes 0")]

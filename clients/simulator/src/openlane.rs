@@ -13,7 +13,7 @@
 
 use std::{fs, path::Path};
 
-use lanemap_core::evaluation::GroundFrame;
+use lanemap_core::{Pose, evaluation::GroundFrame};
 use lanemap_openlane::{
     AnnotatedLane, Annotation, DetectedLane, DetectionFile, OpenLaneError, write_annotation, write_result,
 };
@@ -22,10 +22,12 @@ use rand::Rng;
 use serde_json::{Value, json};
 
 use crate::{
+    camera::Camera,
     drive::motion::FRAME_RATE_HZ,
     random::{Purpose, SimRng},
-    simulation::{Scenario, SimulatedDrive, SimulatedFrame, Simulation},
-    truth_map::{TrueLine, truth_map},
+    road::RoadNetwork,
+    simulation::{DriveSimulation, Scenario, SimulatedFrame},
+    truth_map::{TrueLine, TruthMap},
     view::LineView,
 };
 
@@ -42,48 +44,96 @@ pub fn drive_name(scenario: &Scenario, number: u32) -> String {
     format!("segment-sim-{}-{number:02}", scenario.seed.0)
 }
 
-/// Writes a simulation of `scenario` below `root`, which is made where it is not there.
+/// What was written.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Written {
+    /// Drives.
+    pub drives: u32,
+    /// Frames of all drives.
+    pub frames: usize,
+    /// Distance driven, metres.
+    pub length_m: f64,
+}
+
+/// Simulates a scenario and writes it below `root`, which is made where it is not there, frame by frame.
 ///
 /// # Errors
 /// A folder or file that cannot be written.
-pub fn write_simulation(root: &Path, scenario: &Scenario, simulation: &Simulation) -> Result<(), OpenLaneError> {
+pub fn write_simulation(root: &Path, scenario: &Scenario) -> Result<Written, OpenLaneError> {
+    let network = RoadNetwork::build(&scenario.network, scenario.max_grade, scenario.seed);
+    let mut written = Written::default();
     let mut index = Vec::new();
-    for drive in &simulation.drives {
-        let name = drive_name(scenario, drive.number);
-        let rng = &mut scenario.seed.stream(Purpose::TrackIds, drive.number);
-        for frame in &drive.frames {
-            let annotation = annotation_of(&name, drive, frame);
-            let time = frame.truth.time;
-            write_annotation(root, &name, time, &annotation)?;
-            write_result(&root.join("results"), &name, time, &annotation, &detections_of(drive, frame, rng))?;
-        }
-        let map = truth_map(drive, &simulation.network);
-        write_json(&root.join("maps"), &format!("{name}.geojson"), &geojson_of(&name, &map))?;
-        index.push(index_entry(&name, scenario, drive, map.len()));
+    for number in 0..scenario.drives {
+        let drive = DriveSimulation::start(scenario, &network, number);
+        written.drives += 1;
+        written.frames += drive.states().len();
+        written.length_m += drive.length_m();
+        index.push(write_drive(root, scenario, &network, number, drive)?);
     }
-    let roads: Vec<TrueLine> = simulation.network.lines().iter().map(TrueLine::whole).collect();
+    let roads: Vec<TrueLine> = network.lines().iter().map(TrueLine::whole).collect();
     write_json(root, "network.geojson", &geojson_of("network", &roads))?;
     let index = json!({ "set": "simulated", "seed": scenario.seed.0, "hz": FRAME_RATE_HZ, "drives": index });
-    write_json(root, "index.json", &index)
+    write_json(root, "index.json", &index)?;
+    Ok(written)
+}
+
+/// Writes one drive and its true map; gives its entry of the index.
+fn write_drive(
+    root: &Path,
+    scenario: &Scenario,
+    network: &RoadNetwork,
+    number: u32,
+    drive: DriveSimulation<'_>,
+) -> Result<Value, OpenLaneError> {
+    let name = drive_name(scenario, number);
+    let (frames, length_m, duration_s) = (drive.states().len(), drive.length_m(), drive.duration_s());
+    let (results, ground) = (root.join("results"), GroundFrame::below(&scenario.camera.sensor()));
+    let rng = &mut scenario.seed.stream(Purpose::TrackIds, number);
+    let mut map = TruthMap::default();
+    for frame in drive {
+        let annotation = annotation_of(&name, &scenario.camera, &frame);
+        let time = frame.truth.time;
+        write_annotation(root, &name, time, &annotation)?;
+        write_result(&results, &name, time, &annotation, &detections_of(&frame, &ground, rng))?;
+        map.observe(&frame);
+    }
+    let lines = map.lines(network);
+    write_json(&root.join("maps"), &format!("{name}.geojson"), &geojson_of(&name, &lines))?;
+    let mut entry = json!({
+        "name": name,
+        "frames": frames,
+        "path_m": (length_m * 10.0).round() / 10.0,
+        "lines": lines.len(),
+        "mean_speed_mps": (length_m / duration_s.max(1e-9) * 100.0).round() / 100.0,
+        "source": "simulated",
+        "categories": "made",
+        "detections": "simulated",
+        "geometry": "made",
+        "poses": "made",
+    });
+    if scenario.shared_route {
+        entry["road"] = json!(format!("sim-{}", scenario.seed.0));
+        entry["traversal"] = json!(number);
+    }
+    Ok(entry)
 }
 
 /// The annotation of one frame: what is truly there.
 #[must_use]
-pub fn annotation_of(name: &str, drive: &SimulatedDrive, frame: &SimulatedFrame) -> Annotation {
+pub fn annotation_of(name: &str, camera: &Camera, frame: &SimulatedFrame) -> Annotation {
     let stem = lanemap_openlane::timestamp_stem(frame.truth.time);
     Annotation {
         path: std::path::PathBuf::new(),
-        intrinsic: drive.camera.intrinsic,
-        vehicle_from_camera: drive.camera.vehicle_from_camera,
+        intrinsic: camera.intrinsic,
+        vehicle_from_camera: camera.vehicle_from_camera,
         world_from_vehicle: Some(frame.truth.world_from_vehicle),
         world_from_vehicle_gnss: Some(frame.gnss_world_from_vehicle),
         image: format!("simulated/{name}/{stem}.jpg"),
-        lanes: frame.views.iter().map(|view| annotated(view, &frame.views, drive)).collect(),
+        lanes: frame.views.iter().map(|view| annotated(view, &frame.views, &camera.vehicle_from_camera)).collect(),
     }
 }
 
-fn annotated(view: &LineView, all: &[LineView], drive: &SimulatedDrive) -> AnnotatedLane {
-    let mount = &drive.camera.vehicle_from_camera;
+fn annotated(view: &LineView, all: &[LineView], vehicle_from_camera: &Pose) -> AnnotatedLane {
     AnnotatedLane {
         category: view.category,
         track_id: i64::from(view.line.0),
@@ -91,7 +141,7 @@ fn annotated(view: &LineView, all: &[LineView], drive: &SimulatedDrive) -> Annot
         points_camera: view
             .visible_points()
             .iter()
-            .map(|point| rounded(mount.inverse_transform_point(point), TRUTH_STEPS_PER_M))
+            .map(|point| rounded(vehicle_from_camera.inverse_transform_point(point), TRUTH_STEPS_PER_M))
             .collect(),
     }
 }
@@ -111,8 +161,7 @@ fn attribute(view: &LineView, all: &[LineView]) -> i64 {
     }
 }
 
-fn detections_of(drive: &SimulatedDrive, frame: &SimulatedFrame, rng: &mut SimRng) -> DetectionFile {
-    let ground = GroundFrame::below(&drive.camera.sensor());
+fn detections_of(frame: &SimulatedFrame, ground: &GroundFrame, rng: &mut SimRng) -> DetectionFile {
     let lanes = frame
         .detections
         .iter()
@@ -158,26 +207,6 @@ fn geojson_of(name: &str, lines: &[TrueLine]) -> Value {
     })
 }
 
-fn index_entry(name: &str, scenario: &Scenario, drive: &SimulatedDrive, lines: usize) -> Value {
-    let mut entry = json!({
-        "name": name,
-        "frames": drive.frames.len(),
-        "path_m": (drive.length_m() * 10.0).round() / 10.0,
-        "lines": lines,
-        "mean_speed_mps": (drive.length_m() / drive.duration_s().max(1e-9) * 100.0).round() / 100.0,
-        "source": "simulated",
-        "categories": "made",
-        "detections": "simulated",
-        "geometry": "made",
-        "poses": "made",
-    });
-    if scenario.shared_route {
-        entry["road"] = json!(format!("sim-{}", scenario.seed.0));
-        entry["traversal"] = json!(drive.number);
-    }
-    entry
-}
-
 fn write_json(folder: &Path, file: &str, value: &Value) -> Result<(), OpenLaneError> {
     fs::create_dir_all(folder).map_err(|source| OpenLaneError::Io { path: folder.to_owned(), source })?;
     let path = folder.join(file);
@@ -187,6 +216,7 @@ fn write_json(folder: &Path, file: &str, value: &Value) -> Result<(), OpenLaneEr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Simulation;
     use lanemap_openlane::Drives;
 
     #[test]
@@ -194,7 +224,8 @@ mod tests {
         let scenario = Scenario { drives: 1, length_m: 250.0, ..Scenario::town(5) };
         let simulation = Simulation::run(&scenario);
         let folder = tempfile::tempdir().unwrap();
-        write_simulation(folder.path(), &scenario, &simulation).unwrap();
+        let written = write_simulation(folder.path(), &scenario).unwrap();
+        assert_eq!(written.frames, simulation.drives[0].frames.len());
 
         let drives = Drives::list(folder.path(), &[]).unwrap();
         assert_eq!(drives[0].len(), simulation.drives[0].frames.len());

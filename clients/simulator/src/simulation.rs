@@ -1,7 +1,7 @@
 //! The whole: a scenario in, a network with several simulated drives out.
 
 use lanemap_core::{
-    Detection, FrameParts, Odometry, Pose, Sequence, TimestampNs, geometry::georeference::Georeference,
+    Detection, FrameParts, Odometry, Pose, Sensor, Sequence, TimestampNs, geometry::georeference::Georeference,
 };
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
@@ -95,17 +95,30 @@ pub struct Simulation {
     pub drives: Vec<SimulatedDrive>,
 }
 
-/// One simulated drive: the truth, and what the vehicle knows of it.
+/// A drive that is being simulated, frame by frame: a drive of any length takes the memory of its poses only.
+#[derive(Debug)]
+pub struct DriveSimulation<'a> {
+    scenario: &'a Scenario,
+    network: &'a RoadNetwork,
+    route: Route,
+    world_from_odometry: Pose,
+    states: Vec<TrueState>,
+    gnss: Vec<Pose>,
+    odometry: Vec<Pose>,
+    detector: Detector,
+    sensor: Sensor,
+    next: usize,
+}
+
+/// One simulated drive, whole: the truth, and what the vehicle knows of it.
 #[derive(Debug)]
 pub struct SimulatedDrive {
     /// Number within the simulation.
     pub number: u32,
     /// The camera.
     pub camera: Camera,
-    /// Where the drive's odometry frame truly lies: its origin is below the first pose, its x axis along it.
+    /// Where the drive's odometry frame truly lies: its origin is at the first pose, its x axis along it.
     pub world_from_odometry: Pose,
-    /// Noise of the odometry.
-    pub odometry_noise: OdometryNoise,
     /// Frames at 10 Hz.
     pub frames: Vec<SimulatedFrame>,
 }
@@ -113,12 +126,16 @@ pub struct SimulatedDrive {
 /// One frame of a simulated drive.
 #[derive(Debug)]
 pub struct SimulatedFrame {
+    /// Number in the drive, from 1.
+    pub sequence: Sequence,
     /// Where the vehicle truly is.
     pub truth: TrueState,
     /// What of the road is truly in sight, from left to right.
     pub views: Vec<LineView>,
     /// Where the vehicle's odometry has it, in the odometry frame of the drive.
     pub odometry_from_vehicle: Pose,
+    /// Noise of that odometry.
+    pub odometry_noise: OdometryNoise,
     /// Where GNSS has it, in the world.
     pub gnss_world_from_vehicle: Pose,
     /// What the detector reports.
@@ -135,10 +152,10 @@ impl Simulation {
     }
 }
 
-impl SimulatedDrive {
-    /// Simulates one drive of a scenario through its network.
+impl<'a> DriveSimulation<'a> {
+    /// Drive `number` of a scenario through its network, before its first frame.
     #[must_use]
-    pub fn run(scenario: &Scenario, network: &RoadNetwork, number: u32) -> Self {
+    pub fn start(scenario: &'a Scenario, network: &'a RoadNetwork, number: u32) -> Self {
         let seed = scenario.seed;
         let route = route_of(scenario, network, number);
         let mut rng = seed.stream(Purpose::Motion, number);
@@ -150,51 +167,96 @@ impl SimulatedDrive {
         let (world_from_odometry, odometry) =
             odometry_of(scenario.odometry, &states, &mut seed.stream(Purpose::Odometry, number));
         let sensor = scenario.camera.sensor();
-        let mut detector = Detector::new(scenario.detector, sensor, seed.stream(Purpose::Detector, number));
-        let frames = states
-            .into_iter()
-            .zip(gnss)
-            .zip(odometry)
-            .map(|((truth, gnss_world_from_vehicle), odometry_from_vehicle)| {
-                let views = lines_in_view(network, &route.legs, truth.leg, &truth.world_from_vehicle, &sensor);
-                let detections = detector.observe(&views, 1.0 / FRAME_RATE_HZ);
-                SimulatedFrame { truth, views, odometry_from_vehicle, gnss_world_from_vehicle, detections }
-            })
-            .collect();
-        Self { number, camera: scenario.camera, world_from_odometry, odometry_noise: scenario.odometry, frames }
+        let detector = Detector::new(scenario.detector, sensor, seed.stream(Purpose::Detector, number));
+        Self { scenario, network, route, world_from_odometry, states, gnss, odometry, detector, sensor, next: 0 }
     }
 
-    /// The frame that the vehicle would stream: what it knows, nothing of the truth. Sequences begin at 1.
-    ///
-    /// With `world_on_earth`, which puts the simulation's world on the earth, the frame has a GNSS fix.
-    ///
-    /// # Panics
-    /// Where there is no frame `index`.
+    /// Where the drive's odometry frame truly lies: its origin is at the first pose, its x axis along it.
     #[must_use]
-    pub fn frame_parts(&self, index: usize, world_on_earth: Option<&Georeference>) -> FrameParts {
-        let frame = &self.frames[index];
-        FrameParts {
-            sequence: Sequence(index as u64 + 1),
-            time: frame.truth.time,
-            odometry: Odometry {
-                odometry_from_vehicle: frame.odometry_from_vehicle,
-                motion_covariance: Some(self.odometry_noise.motion_covariance()),
-            },
-            gnss: world_on_earth.map(|world| world.fix_at(&frame.gnss_world_from_vehicle, GNSS_SIGMA_M, GNSS_SIGMA_M)),
-            detections: frame.detections.clone(),
-        }
+    pub fn world_from_odometry(&self) -> Pose {
+        self.world_from_odometry
+    }
+
+    /// Where the vehicle truly is at each frame.
+    #[must_use]
+    pub fn states(&self) -> &[TrueState] {
+        &self.states
     }
 
     /// Time from the first to the last frame, seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
-        (self.frames.len().saturating_sub(1)) as f64 * FRAME_PERIOD_NS as f64 * 1e-9
+        (self.states.len().saturating_sub(1)) as f64 * FRAME_PERIOD_NS as f64 * 1e-9
     }
 
     /// Distance driven, metres.
     #[must_use]
     pub fn length_m(&self) -> f64 {
-        self.frames.last().map_or(0.0, |frame| frame.truth.distance_m)
+        self.states.last().map_or(0.0, |state| state.distance_m)
+    }
+}
+
+impl Iterator for DriveSimulation<'_> {
+    type Item = SimulatedFrame;
+
+    fn next(&mut self) -> Option<SimulatedFrame> {
+        let index = self.next;
+        let truth = *self.states.get(index)?;
+        self.next += 1;
+        let legs = &self.route.legs;
+        let views = lines_in_view(self.network, legs, truth.leg, &truth.world_from_vehicle, &self.sensor);
+        let detections = self.detector.observe(&views, 1.0 / FRAME_RATE_HZ);
+        Some(SimulatedFrame {
+            sequence: Sequence(index as u64 + 1),
+            truth,
+            views,
+            odometry_from_vehicle: self.odometry[index],
+            odometry_noise: self.scenario.odometry,
+            gnss_world_from_vehicle: self.gnss[index],
+            detections,
+        })
+    }
+}
+
+impl SimulatedFrame {
+    /// The frame that the vehicle would stream: what it knows, nothing of the truth. Sequences begin at 1.
+    ///
+    /// With `world_on_earth`, which puts the simulation's world on the earth, the frame has a GNSS fix.
+    #[must_use]
+    pub fn parts(&self, world_on_earth: Option<&Georeference>) -> FrameParts {
+        FrameParts {
+            sequence: self.sequence,
+            time: self.truth.time,
+            odometry: Odometry {
+                odometry_from_vehicle: self.odometry_from_vehicle,
+                motion_covariance: Some(self.odometry_noise.motion_covariance()),
+            },
+            gnss: world_on_earth.map(|world| world.fix_at(&self.gnss_world_from_vehicle, GNSS_SIGMA_M, GNSS_SIGMA_M)),
+            detections: self.detections.clone(),
+        }
+    }
+}
+
+impl SimulatedDrive {
+    /// Simulates one drive of a scenario through its network.
+    #[must_use]
+    pub fn run(scenario: &Scenario, network: &RoadNetwork, number: u32) -> Self {
+        let simulation = DriveSimulation::start(scenario, network, number);
+        Self {
+            number,
+            camera: scenario.camera,
+            world_from_odometry: simulation.world_from_odometry(),
+            frames: simulation.collect(),
+        }
+    }
+
+    /// The frame that the vehicle would stream; see [`SimulatedFrame::parts`].
+    ///
+    /// # Panics
+    /// Where there is no frame `index`.
+    #[must_use]
+    pub fn frame_parts(&self, index: usize, world_on_earth: Option<&Georeference>) -> FrameParts {
+        self.frames[index].parts(world_on_earth)
     }
 }
 

@@ -9,7 +9,8 @@ use nalgebra::Point3;
 
 use crate::{
     road::{RoadLine, RoadLineId, RoadNetwork},
-    simulation::SimulatedDrive,
+    simulation::SimulatedFrame,
+    view::LineView,
 };
 
 /// A line seen in fewer frames is left out.
@@ -36,24 +37,48 @@ impl TrueLine {
     }
 }
 
-/// The true map of a drive, in the order of the lines' numbers.
-#[must_use]
-pub fn truth_map(drive: &SimulatedDrive, network: &RoadNetwork) -> Vec<TrueLine> {
-    let mut seen: BTreeMap<RoadLineId, (Category, Range<usize>, u32)> = BTreeMap::new();
-    for view in drive.frames.iter().flat_map(|frame| &frame.views) {
-        let (_, stretch, frames) = seen.entry(view.line).or_insert((view.category, view.stretch.clone(), 0));
-        *stretch = stretch.start.min(view.stretch.start)..stretch.end.max(view.stretch.end);
-        *frames += 1;
+/// The true map of a drive that goes on.
+#[derive(Clone, Debug, Default)]
+pub struct TruthMap {
+    seen: BTreeMap<RoadLineId, SeenLine>,
+}
+
+#[derive(Clone, Debug)]
+struct SeenLine {
+    category: Category,
+    stretch: Range<usize>,
+    frames: u32,
+}
+
+impl TruthMap {
+    /// Adds what one frame had in sight.
+    pub fn observe(&mut self, frame: &SimulatedFrame) {
+        for view in &frame.views {
+            let LineView { category, stretch, .. } = view;
+            let seen = self.seen.entry(view.line).or_insert_with(|| SeenLine {
+                category: *category,
+                stretch: stretch.clone(),
+                frames: 0,
+            });
+            seen.stretch = seen.stretch.start.min(stretch.start)..seen.stretch.end.max(stretch.end);
+            seen.frames += 1;
+        }
     }
-    seen.into_iter()
-        .filter(|(_, (_, _, frames))| *frames >= MIN_FRAMES)
-        .map(|(line, (category, stretch, frames_seen))| TrueLine {
-            line,
-            category,
-            frames_seen,
-            points: network.line(line).points[stretch].to_vec(),
-        })
-        .collect()
+
+    /// The lines so far, in the order of their numbers.
+    #[must_use]
+    pub fn lines(&self, network: &RoadNetwork) -> Vec<TrueLine> {
+        self.seen
+            .iter()
+            .filter(|(_, seen)| seen.frames >= MIN_FRAMES)
+            .map(|(line, seen)| TrueLine {
+                line: *line,
+                category: seen.category,
+                frames_seen: seen.frames,
+                points: network.line(*line).points[seen.stretch.clone()].to_vec(),
+            })
+            .collect()
+    }
 }
 
 #[cfg(test)]
@@ -65,7 +90,9 @@ mod tests {
     fn the_true_map_holds_every_line_that_was_annotated_for_a_while() {
         let simulation = Simulation::run(&Scenario { drives: 1, length_m: 400.0, ..Scenario::town(6) });
         let drive = &simulation.drives[0];
-        let map = truth_map(drive, &simulation.network);
+        let mut map = TruthMap::default();
+        drive.frames.iter().for_each(|frame| map.observe(frame));
+        let map = map.lines(&simulation.network);
         assert!(map.len() >= 3);
         for frame in &drive.frames {
             for view in &frame.views {

@@ -7,7 +7,7 @@ use std::{
 
 use lanemap_client::{ClientError, IngestClient, Session, SessionStart};
 use lanemap_core::{Frame, FrameError, FrameLimits, TimestampNs, geometry::georeference::Georeference};
-use lanemap_simulator::{Scenario, SimulatedDrive, drive::motion::FRAME_RATE_HZ, road::RoadNetwork};
+use lanemap_simulator::{DriveSimulation, Scenario, drive::motion::FRAME_RATE_HZ, road::RoadNetwork};
 use thiserror::Error;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
@@ -28,8 +28,6 @@ enum DriveError {
     Client(#[from] ClientError),
     #[error("a simulated frame is not valid: {0}")]
     Frame(#[from] FrameError),
-    #[error("the simulation failed: {0}")]
-    Simulation(#[from] tokio::task::JoinError),
 }
 
 /// What all vehicles share.
@@ -93,21 +91,17 @@ async fn keep_driving(
 async fn one_drive(
     vehicle: u32,
     number: u32,
-    town: &Arc<Town>,
+    town: &Town,
     client: &IngestClient,
     stop: &CancellationToken,
 ) -> Result<(), DriveError> {
-    let drive = tokio::task::spawn_blocking({
-        let town = Arc::clone(town);
-        move || SimulatedDrive::run(&town.scenario, &town.network, number)
-    })
-    .await?;
+    let drive = DriveSimulation::start(&town.scenario, &town.network, number);
     let start = SessionStart {
-        sensor: drive.camera.sensor(),
+        sensor: town.scenario.camera.sensor(),
         ..SessionStart::new("demo", format!("vehicle-{vehicle}"), format!("{}-{number}", town.began_unix_s))
     };
     let (mut session, _events) = client.start_session(start).await?;
-    let all_driven = stream(&mut session, &drive, &town.on_earth, stop).await?;
+    let all_driven = stream(&mut session, drive, &town.on_earth, stop).await?;
     let summary = if all_driven { session.finish().await? } else { session.close().await? };
     tracing::debug!(vehicle, number, ?summary, "drive over");
     Ok(())
@@ -116,7 +110,7 @@ async fn one_drive(
 /// Sends the frames at 10 Hz; `false` where it was stopped before the last.
 async fn stream(
     session: &mut Session,
-    drive: &SimulatedDrive,
+    drive: DriveSimulation<'_>,
     on_earth: &Georeference,
     stop: &CancellationToken,
 ) -> Result<bool, DriveError> {
@@ -124,9 +118,9 @@ async fn stream(
     let mut ticks = interval(Duration::from_secs_f64(1.0 / FRAME_RATE_HZ));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
     let _: Instant = ticks.tick().await;
-    let recorded_ns = drive.frames.first().map_or(0, |frame| frame.truth.time.0);
-    for index in 0..drive.frames.len() {
-        let mut parts = drive.frame_parts(index, Some(on_earth));
+    let recorded_ns = drive.states().first().map_or(0, |state| state.time.0);
+    for frame in drive {
+        let mut parts = frame.parts(Some(on_earth));
         parts.time = TimestampNs(parts.time.0 - recorded_ns + began_ns);
         let frame = Frame::new(parts, &FrameLimits::default())?;
         tokio::select! {

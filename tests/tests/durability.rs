@@ -82,13 +82,15 @@ async fn a_session_leaves_memory_when_its_vehicle_is_gone_and_goes_on_when_it_is
 
 #[tokio::test(flavor = "multi_thread")]
 async fn no_acked_frame_is_lost_when_the_server_is_killed_again_and_again() {
-    const KILLS: u64 = 10;
     const VEHICLES: u64 = 3;
+    // More of them by `TEST_KILLS=200`.
+    let kills: u64 = std::env::var("TEST_KILLS").map_or(10, |kills| kills.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
-    let drives: Vec<_> = (0..VEHICLES).map(|seed| drives::simulated(10 + seed, 330)).collect();
+    let frames = usize::try_from(kills * 29 + 40).unwrap();
+    let drives: Vec<_> = (0..VEHICLES).map(|seed| drives::simulated(10 + seed, frames)).collect();
     let mut acked = vec![None; drives.len()];
 
-    for kill in 1..=KILLS {
+    for kill in 1..=kills {
         let mut server = ServerProcess::start(env!("CARGO_BIN_EXE_killable-server"), folder.path());
         // Far into the drive, at another place of it for every kill and every vehicle's stream.
         let until = Sequence(kill * 29 + 1);
@@ -113,6 +115,15 @@ async fn no_acked_frame_is_lost_when_the_server_is_killed_again_and_again() {
         session.finish().await.unwrap();
         assert_same_map(&map_bytes(&server.url, &id).await, drive);
     }
+}
+
+#[tokio::test]
+async fn a_second_server_on_the_same_store_is_refused_and_the_first_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let first = servers::start(folder.path()).await;
+    let error = Server::start(servers::config(folder.path())).await.unwrap_err().to_string();
+    assert!(error.contains(&folder.path().display().to_string()) && error.contains("Locked"), "{error}");
+    IngestClient::connect(first.url()).await.unwrap();
 }
 
 /// A vehicle that goes on sending, whatever happens to the server.

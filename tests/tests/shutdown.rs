@@ -7,7 +7,8 @@ use std::time::Duration;
 use lanemap_proto::encode;
 use lanemap_tests::{drives, raw_stream::RawStream, servers};
 use tokio::time::timeout;
-use tonic::Code;
+use tonic::{Code, transport::Channel};
+use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
 
 /// The longest that a shutdown may take.
 const LONGEST: Duration = Duration::from_secs(10);
@@ -61,10 +62,25 @@ async fn a_vehicle_that_never_reads_holds_no_shutdown() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn who_watches_health_hears_of_a_shutdown_before_the_connection_closes() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let channel = Channel::from_shared(server.url()).unwrap().connect().await.unwrap();
+    let mut client = HealthClient::new(channel);
+    let service = "lanemap.v1.IngestService".to_owned();
+    let mut health = client.watch(HealthCheckRequest { service }).await.unwrap().into_inner();
+    assert_eq!(health.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
+    server.shutdown_token().cancel();
+    assert_eq!(health.message().await.unwrap().unwrap().status(), ServingStatus::NotServing);
+    // The watch stays open: it holds the shutdown no longer than it may.
+    timeout(LONGEST, server.stopped()).await.expect("the shutdown takes too long");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_new_stream_is_turned_away_while_the_service_shuts_down() {
     let folder = tempfile::tempdir().unwrap();
     let server = servers::start(folder.path()).await;
-    let channel = tonic::transport::Channel::from_shared(server.url()).unwrap().connect().await.unwrap();
+    let channel = Channel::from_shared(server.url()).unwrap().connect().await.unwrap();
     server.shutdown_token().cancel();
     let mut stream = match timeout(LONGEST, async { RawStream::try_open_on(channel).await }).await.unwrap() {
         Ok(stream) => stream,

@@ -1,10 +1,15 @@
 //! Reads maps over HTTP.
 
+use std::time::Duration;
+
 use lanemap_core::LaneMap;
 use lanemap_proto::{decode, v1};
 use prost::Message;
 
 use crate::error::{ClientError, with_sources};
+
+/// Longest wait for a map.
+const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Reads the maps of one service. Clones share connections.
 #[derive(Clone, Debug)]
@@ -40,7 +45,7 @@ impl MapClient {
     async fn get(&self, path: &str) -> Result<Vec<u8>, ClientError> {
         let url = format!("{}{path}", self.base);
         let unreachable = |error: reqwest::Error| ClientError::Unreachable(with_sources(&error));
-        let response = self.http.get(&url).send().await.map_err(unreachable)?;
+        let response = self.http.get(&url).timeout(TIMEOUT).send().await.map_err(unreachable)?;
         let status = response.status();
         let body = response.bytes().await.map_err(unreachable)?;
         if status.is_success() {

@@ -336,7 +336,7 @@ mod tests {
         #[test]
         fn no_bytes_panic_the_decoder(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
             if let Ok(message) = v1::Frame::decode(bytes.as_slice()) {
-                let _ = super::frame(&message, &PointFrame::Vehicle, &FrameLimits::default());
+                let _ = frame(&message, &PointFrame::Vehicle, &FrameLimits::default());
             }
             if let Ok(message) = v1::SessionStart::decode(bytes.as_slice()) {
                 let _ = start(&message);

@@ -9,6 +9,7 @@ use std::{
     time::{SystemTime, UNIX_EPOCH},
 };
 
+use futures::{StreamExt, stream};
 use lanemap_proto::v1::RefusalReason;
 use tokio::{
     sync::{Mutex as AsyncMutex, OwnedSemaphorePermit, Semaphore, mpsc, oneshot},
@@ -107,10 +108,8 @@ impl SessionRegistry {
         let records = blocking(move || journal.records()).await?;
         let mut slots = HashMap::with_capacity(records.len());
         let last_id = records.last().map(|record| record.id);
+        stream::iter(&records).for_each_concurrent(cores(), |record| recover_one(&surroundings, record)).await;
         for record in records {
-            if let Err(error) = recover_one(&surroundings, &record).await {
-                tracing::error!(session = %record.id, %error, "the session cannot be served");
-            }
             let slot = Slot { record: Some(record.clone()), actor: None };
             slots.insert(record.key, Arc::new(AsyncMutex::new(slot)));
         }
@@ -275,14 +274,19 @@ async fn attach(
     at.await.ok()
 }
 
-async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) -> Result<(), Error> {
+/// Publishes what the store knows of a session; one that cannot be read is reported and left as it is.
+async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) {
     let (session, journal) = (record.id, surroundings.journal.clone());
-    let loading = record.clone();
-    let loaded = blocking(move || load(&journal, loading)).await;
-    let (record, drive) = loaded.map_err(|error| unreadable(session, &error))?;
     let state = if record.ended { SessionState::Closed } else { SessionState::Idle };
-    surroundings.sessions.publish(drive.published(session, state));
-    Ok(())
+    let loading = record.clone();
+    match blocking(move || Ok(load(&journal, loading)?.1.published(session, state))).await {
+        Ok(published) => surroundings.sessions.publish(published),
+        Err(error) => tracing::error!(%session, %error, "the session cannot be served"),
+    }
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
 /// The drive as the store knows it: its snapshot, and the frames after it mapped again.

@@ -169,7 +169,8 @@ fn as_text(pairs: usize, methods: &[Method], headings: &[(f64, Vec<MethodScore>)
     let mut text = format!("Association, {pairs} pairs of frames; pose error 3 m in x and y, 2 degrees in yaw.\n");
     for (heading, scores) in headings {
         let many = scores.first().map_or(0, |score| score.many.pairs);
-        text += &format!("\nmap turned by {heading} degrees; {many} pairs with {MANY_LANES} lanes or more\n");
+        text.push('\n');
+        text.push_str(&heading_line(*heading, many));
         let mut table = Table::new(&["", "F1", "precision", "recall", "F1 >= 5 lanes", "mean us"]);
         for (method, score) in methods.iter().zip(scores) {
             let mut cells = vec![method.name().to_owned()];
@@ -181,6 +182,10 @@ fn as_text(pairs: usize, methods: &[Method], headings: &[(f64, Vec<MethodScore>)
         text.push_str(&table.render());
     }
     text
+}
+
+fn heading_line(heading_deg: f64, many: u64) -> String {
+    format!("map turned by {heading_deg} degrees; {many} pairs with {MANY_LANES} lanes or more\n")
 }
 
 fn mean_us(score: &MethodScore) -> f64 {

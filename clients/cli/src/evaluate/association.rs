@@ -28,7 +28,8 @@ use super::{
 /// Pairs with at least this many lanes in frame a are counted a second time for themselves, as for the authors' code.
 const MANY_LANES: usize = 5;
 /// Error of the poses between the frames, as the paper draws it.
-const POSE: PoseUncertainty = PoseUncertainty { yaw_rad: 2.0 * std::f64::consts::PI / 180.0, along_m: 3.0, across_m: 3.0 };
+const POSE: PoseUncertainty =
+    PoseUncertainty { yaw_rad: 2.0 * std::f64::consts::PI / 180.0, along_m: 3.0, across_m: 3.0 };
 
 #[derive(Debug, Args)]
 pub struct AssociationArgs {

@@ -58,7 +58,8 @@ pub struct ReplayArgs {
     #[arg(long, conflicts_with = "server")]
     local: bool,
     /// Folder for the online local map of every frame (3 to 50 m ahead, 10 m to each side, what was known at that
-    /// frame), in OpenLane's result format under the drives' own folder and file names
+    /// frame), in OpenLane's result format under the drives' own folder and file names; with --server too it is the
+    /// mapper in this process that makes it, on the frames that are streamed
     #[arg(long, value_name = "OUT")]
     results_dir: Option<PathBuf>,
     /// Latitude and longitude (degrees) of the origin of the drives' world: poses become GNSS fixes, those of the drive's

@@ -22,6 +22,7 @@ pub mod odometry;
 pub mod openlane;
 pub mod random;
 pub mod road;
+pub mod scenario;
 pub mod simulation;
 pub mod truth_map;
 pub mod view;
@@ -29,7 +30,8 @@ pub mod view;
 pub use camera::Camera;
 pub use odometry::OdometryNoise;
 pub use random::Seed;
-pub use simulation::{DriveSimulation, Scenario, SimulatedDrive, SimulatedFrame, Simulation};
+pub use scenario::Scenario;
+pub use simulation::{DriveSimulation, SimulatedDrive, SimulatedFrame, Simulation};
 
 /// A count from a finite number that is not negative, cut to whole; anything else is 0.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, and NaN becomes 0")]

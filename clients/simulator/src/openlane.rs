@@ -26,7 +26,8 @@ use crate::{
     drive::motion::FRAME_RATE_HZ,
     random::{Purpose, SimRng},
     road::RoadNetwork,
-    simulation::{DriveSimulation, Scenario, SimulatedFrame},
+    scenario::Scenario,
+    simulation::{DriveSimulation, SimulatedFrame},
     truth_map::{TrueLine, TruthMap},
     view::LineView,
 };

@@ -115,7 +115,7 @@ pub fn observe(
         samples: Vec::new(),
     };
     observation.samples = resample(&observation, params, range_m);
-    Some(observation)
+    (observation.samples.len() >= params.least_samples).then_some(observation)
 }
 
 fn crop(points: &[Point3<f64>], below_camera: &Point3<f64>, params: &ObservationParams) -> Vec<Point3<f64>> {
@@ -254,7 +254,7 @@ mod tests {
     fn too_few_points_in_the_box_are_no_observation() {
         let behind = (0..9).map(|k| Point3::new(-f64::from(k), 0.0, 0.0)).collect();
         assert!(observe(&detection(behind), 0, &Sensor::default(), &params()).is_none());
-        assert!(observe(&detection(rows(|_| 0.0)[..2].to_vec()), 0, &Sensor::default(), &params()).is_none());
+        assert!(observe(&detection(rows(|_| 0.0)[..1].to_vec()), 0, &Sensor::default(), &params()).is_none());
         assert!(observe(&detection(vec![Point3::new(9.0, 0.0, 0.0); 50]), 0, &Sensor::default(), &params()).is_none());
     }
 }

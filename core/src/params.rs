@@ -74,8 +74,10 @@ pub struct ObservationParams {
     pub side_m: f64,
     /// Least distance of two points along the line, metres.
     pub thin_m: f64,
-    /// Fewer points than this are no observation.
+    /// Fewer measured points than this are no observation.
     pub least_points: usize,
+    /// Fewer samples than this, after resampling, are no observation.
+    pub least_samples: usize,
     /// A shorter line is no observation, metres.
     pub least_length_m: f64,
     /// Below this spread the line counts as flat in that axis, metres.
@@ -183,7 +185,7 @@ pub struct LandmarkParams {
     pub ends: EndRule,
     /// Standard deviation of a chordal term, metres (paper: 1).
     pub chord_sigma_m: f64,
-    /// Standard deviation of a second difference of control points, metres; infinite: no such term.
+    /// Standard deviation of a second difference of control points, metres; a kilometre or more: no such term.
     pub bend_sigma_m: f64,
     /// Independent witnesses in one detected line: each sample's information is divided so that they sum to this.
     pub witnesses: f64,
@@ -230,7 +232,8 @@ impl Params {
                 ahead_to_m: 50.0,
                 side_m: 10.0,
                 thin_m: 0.5,
-                least_points: 4,
+                least_points: 2,
+                least_samples: 4,
                 least_length_m: 0.5,
                 flat_spread_m: 0.1,
                 flat_order: 0,
@@ -257,8 +260,8 @@ impl Params {
                 chord_m: 3.0,
                 ends: EndRule::Open,
                 chord_sigma_m: 1.0,
-                bend_sigma_m: f64::INFINITY,
-                witnesses: f64::INFINITY,
+                bend_sigma_m: 1e6,
+                witnesses: 1e6,
                 huber_m: 0.5,
                 window_frames: 0,
                 least_observations: 4,
@@ -284,6 +287,7 @@ impl Params {
                 side_m: 12.0,
                 thin_m: 0.5,
                 least_points: 3,
+                least_samples: 4,
                 least_length_m: 4.0,
                 flat_spread_m: 0.1,
                 flat_order: 1,
@@ -343,9 +347,9 @@ impl Params {
                 least_observations: 3,
                 noise,
                 drawn_share: 0.5,
-                sure_range_m: 20.0,
-                blind_range_m: 45.0,
-                shown_existence: 0.6,
+                sure_range_m: 25.0,
+                blind_range_m: 41.0,
+                shown_existence: 0.7,
                 shown_in_image_m: 8.0,
                 shown_in_window_m: 5.0,
             },
@@ -353,8 +357,8 @@ impl Params {
                 enabled: true,
                 reference_range_m: 50.0,
                 sigmas_m: [0.08, 0.25, 0.4],
-                correlation_s: 0.5,
-                white_sigma_m: 0.1,
+                correlation_s: 0.3,
+                white_sigma_m: 0.05,
                 step_m: 3.0,
                 huber_sigmas: 2.0,
             },

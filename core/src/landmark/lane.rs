@@ -230,7 +230,7 @@ impl Landmark {
     /// Roads bend little within two chords (ours).
     fn straighten(&mut self, first: Knot, params: &LandmarkParams) {
         let information = params.bend_sigma_m.powi(-2);
-        if information > 0.0 {
+        if information > 1e-6 {
             self.fold(Term { first, weights: [1.0, -2.0, 1.0, 0.0], target: Vector3::zeros(), information });
         }
     }

@@ -381,6 +381,7 @@ mod tests {
                                 Some(Correspondence {
                                     foot_map: Point3::new(placed.x, y, 0.0),
                                     tangent_map: Vector3::x(),
+                                    map_variance: 0.0,
                                 })
                             })
                             .collect()

@@ -86,9 +86,9 @@ export function laneLayers(colours, latitude, shown, chosen) {
   return [
     layer("verge", undefined, { "line-color": colours.verge, "line-width": breadth([9, 12]) }),
     layer("chosen", ["==", ["get", "session"], chosen], {
-      "line-color": colours.accent, "line-width": breadth([7, 10]),
+      "line-color": colours.accent, "line-width": breadth([6.6, 8]),
     }),
-    layer("asphalt", undefined, { "line-color": road, "line-width": breadth([5.6, 5]) }),
+    layer("asphalt", undefined, { "line-color": road, "line-width": breadth([6, 5]) }),
     line("curb", among(CURB), { "line-width": breadth([0.32, 2.2]) }),
     line("unknown", ["==", CATEGORY, "unknown"], { "line-dasharray": [2, 3] }),
     line("solid", among(SINGLE.solid), {}),

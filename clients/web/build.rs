@@ -69,7 +69,7 @@ fn install_maplibre(crate_dir: &Path, npm_dir: &Path) -> Result<Vec<File>, Box<d
     }
     let npm = if cfg!(windows) { "npm.cmd" } else { "npm" };
     let output = Command::new(npm)
-        .args(["ci", "--ignore-scripts", "--prefer-offline", "--fetch-retries=1", "--loglevel=error"])
+        .args(["ci", "--ignore-scripts", "--prefer-offline", "--fetch-timeout=60000", "--loglevel=error"])
         .current_dir(npm_dir)
         .output()
         .map_err(|error| format!("npm does not run: {error}"))?;

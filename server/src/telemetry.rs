@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use metrics::{Unit, describe_counter, describe_gauge, describe_histogram};
-use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
+use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 
 /// Frames that were made durable.
 pub const FRAMES_ACKED: &str = "lanemap_frames_acked_total";
@@ -31,6 +31,9 @@ pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 /// Buckets of durations, seconds: 10 us to 10 s.
 const SECONDS: [f64; 13] = [1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25, 1.0, 3.0, 10.0];
 
+/// Buckets of counts of frames.
+const FRAMES: [f64; 10] = [1.0, 3.0, 10.0, 30.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0];
+
 /// Renders the metrics of this process; installs the recorder at the first call.
 ///
 /// Where another recorder was installed before, the handle renders nothing.
@@ -41,10 +44,10 @@ pub fn metrics_handle() -> PrometheusHandle {
 }
 
 fn install() -> PrometheusHandle {
-    let builder = PrometheusBuilder::new();
-    // `set_buckets` refuses an empty slice only.
-    let builder = builder.set_buckets(&SECONDS).unwrap_or_else(|_| PrometheusBuilder::new());
-    let recorder = builder.build_recorder();
+    // Buckets are refused only where there are none.
+    let builder = PrometheusBuilder::new().set_buckets(&SECONDS);
+    let builder = builder.and_then(|b| b.set_buckets_for_metric(Matcher::Full(COMMIT_FRAMES.to_owned()), &FRAMES));
+    let recorder = builder.unwrap_or_default().build_recorder();
     let handle = recorder.handle();
     if metrics::set_global_recorder(recorder).is_err() {
         tracing::warn!("another metrics recorder is installed: /metrics stays empty");

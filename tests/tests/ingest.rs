@@ -200,6 +200,32 @@ async fn a_vehicle_that_never_reads_slows_no_neighbour_and_loses_no_frame() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn vehicles_beyond_the_two_hundred_streams_of_http2_share_one_connection() {
+    const VEHICLES: usize = 250;
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let drive = drives::simulated(5, 12);
+    let client = IngestClient::connect(server.url()).await.unwrap();
+    let vehicles = (0..VEHICLES).map(|number| {
+        let (client, drive) = (&client, &drive);
+        async move {
+            let start = SessionStart { vehicle: format!("vehicle-{number}"), ..drive.start() };
+            let (mut session, _events) = client.start_session(start).await.unwrap();
+            for frame in &drive.frames {
+                session.send(frame).await.unwrap();
+            }
+            session.finish().await.unwrap()
+        }
+    });
+    let summaries = futures::future::join_all(vehicles).await;
+    assert!(summaries.iter().all(|summary| summary.acked == Some(Sequence(12)) && summary.refused == 0));
+    let sessions = server.sessions().list();
+    assert_eq!(sessions.len(), VEHICLES);
+    let expected = drive.mapped().lane_map();
+    assert!(sessions.iter().all(|session| *session.map == expected && session.state == SessionState::Closed));
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn sessions_are_listed_page_by_page_and_name_no_vehicle() {
     let folder = tempfile::tempdir().unwrap();
     let server = servers::start(folder.path()).await;

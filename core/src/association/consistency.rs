@@ -32,7 +32,9 @@ pub fn consistency_scores(edges: &[Edge], detections: &[LaneShape], lanes: &[Lan
     }
     let largest = scores.iter().copied().fold(0.0, f64::max);
     if largest > 0.0 {
-        scores.iter_mut().for_each(|score| *score = (*score / largest).powi(2));
+        for score in &mut scores {
+            *score = (*score / largest).powi(2);
+        }
     } else {
         scores.fill(1.0);
     }

@@ -2,7 +2,7 @@
 //!
 //! Ours; the paper demands equal categories, so that a detector that flips dashed and solid splits a lane in two. Here every
 //! sighting multiplies the belief by `p(seen | true)`: `1 - epsilon` for the right category, the rest shared by all others.
-//! Sightings of one burst of confusion are not independent, so each counts for less than one ([`VOTE`]).
+//! Sightings of one burst of confusion are not independent, so each counts for less than one (`VOTE`).
 
 use serde::{Deserialize, Serialize};
 
@@ -48,7 +48,9 @@ impl CategoryBelief {
         let most = self.votes.iter().copied().fold(0.0, f64::max);
         let mut posterior = self.votes.map(|votes| ((votes - most) * step).exp());
         let sum: f64 = posterior.iter().sum();
-        posterior.iter_mut().for_each(|probability| *probability /= sum);
+        for probability in &mut posterior {
+            *probability /= sum;
+        }
         posterior
     }
 

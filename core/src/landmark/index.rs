@@ -1,6 +1,6 @@
 //! Which lanes run near a place: k-d trees over the control points of each lane, in blocks.
 //!
-//! A lane is cut into blocks of [`BLOCK`] knots; each block has a `kiddo` tree of its own, which is rebuilt only when a
+//! A lane is cut into blocks of `BLOCK` knots; each block has a `kiddo` tree of its own, which is rebuilt only when a
 //! control point of it was added or moved by more than [`STALE_M`], and is listed in the cells of a coarse grid. A query
 //! costs what is near, not what the map holds. It may miss by [`STALE_M`], which the caller's radius allows for.
 
@@ -167,14 +167,13 @@ impl LaneIndex {
 }
 
 /// First and last knot of a block within the radius.
-#[allow(clippy::cast_possible_wrap)] // an index within a block
 fn near_in_block(block: &Block, place: &Point3<f64>, radius_m: f64) -> Option<(Knot, Knot)> {
     let tree = block.tree.as_ref()?;
     let query = [place.x, place.y, place.z];
     let found = tree.query(&query).within::<SquaredEuclidean<f64>>(radius_m * radius_m).unsorted().execute();
     let (mut low, mut high) = (Knot::MAX, Knot::MIN);
     for neighbour in found {
-        let knot = block.first + neighbour.item as Knot;
+        let knot = block.first + Knot::from(neighbour.item);
         low = low.min(knot);
         high = high.max(knot);
     }

@@ -366,6 +366,7 @@ impl<const W: usize> BandedInformation<W> {
     }
 
     /// Puts the total of `sums`, added in their order, in place of the rows of `first ..= last`.
+    #[allow(clippy::needless_pass_by_value)] // a cheap iterator, read once for every row
     pub fn replace<'a>(&mut self, first: Knot, last: Knot, sums: impl Iterator<Item = &'a BandedSum<W>> + Clone) {
         for knot in first..=last {
             let Some(index) = self.index(knot) else { continue };
@@ -413,8 +414,8 @@ impl<const W: usize> BandedInformation<W> {
         for back in (1..=reach).rev() {
             let before = &self.factor[i - back];
             let mut entry = band[back];
-            for further in back + 1..=reach {
-                entry -= scaled[further] * before.left[further - back];
+            for (further, scaled) in scaled.iter().enumerate().take(reach + 1).skip(back + 1) {
+                entry -= scaled * before.left[further - back];
             }
             scaled[back] = entry;
             row.left[back] = entry / before.pivot;

@@ -133,7 +133,7 @@ fn eliminate(
     let (mut residual_squared, mut residual_moments, mut used) = (0.0, Matrix3::zeros(), 0u32);
     for row in rows.iter().filter(inside) {
         let mut residual = row.value;
-        for (k, w) in entries(row).map(|(knot, w)| (knot, w)) {
+        for (k, w) in entries(row) {
             residual -= lane.position(k) * w;
             let a = offset(k);
             for (other, v) in entries(row) {
@@ -156,9 +156,9 @@ fn eliminate(
     let solved: Vec<Vector3<f64>> = coupling.iter().map(|column| factor.solve(column)).collect();
     for a in 0..count {
         term.right[a] = (term.right[a] - moments.transpose() * solved[a]) * robust;
-        for b in 0..count {
+        for (b, solved) in solved.iter().enumerate() {
             let entry = &mut term.information[a * count + b];
-            *entry = (*entry - coupling[a].dot(&solved[b])) * robust;
+            *entry = (*entry - coupling[a].dot(solved)) * robust;
         }
     }
     term

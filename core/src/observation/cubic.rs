@@ -15,6 +15,7 @@ pub struct Cubic {
 impl Cubic {
     /// Fits `(x, value, weight)`; `None` without data. The order falls further where the abscissae are too few.
     #[must_use]
+    #[allow(clippy::needless_pass_by_value)] // a cheap iterator, read several times
     pub fn fit(data: impl Iterator<Item = (f64, f64, f64)> + Clone, order: usize) -> Option<Self> {
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
         for (x, _, _) in data.clone() {

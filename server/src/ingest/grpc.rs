@@ -8,7 +8,7 @@ use lanemap_proto::v1::{
     self, RefusalReason, ingest_service_server::IngestService, stream_observations_request::Message,
     stream_observations_response::Message as Answer,
 };
-use tokio::time::{Instant, timeout};
+use tokio::time::{Instant, sleep};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::{Request, Response, Status, Streaming};
 
@@ -79,7 +79,7 @@ impl IngestGrpc {
         self.detach(&outbox, &attachment, with).await;
     }
 
-    /// Lets the actor send what the stream was promised, then ends it.
+    /// Lets the actor send what the stream was promised, then ends it. Only a shutdown bounds the wait.
     async fn detach(&self, outbox: &Outbox, attachment: &Attachment, with: Result<(), Status>) {
         let last_words = with.clone();
         let promised = async {
@@ -87,8 +87,15 @@ impl IngestGrpc {
                 outbox.finished().await;
             }
         };
-        if timeout(self.config.shutdown_grace() / 2, promised).await.is_err() {
-            tracing::warn!(session = %attachment.session, "a stream did not take what it was promised in time");
+        let overdue = async {
+            self.shutdown.cancelled().await;
+            sleep(self.config.shutdown_grace() / 2).await;
+        };
+        tokio::select! {
+            () = promised => {}
+            () = overdue => {
+                tracing::warn!(session = %attachment.session, "a stream did not take what it was promised in time");
+            }
         }
         outbox.finish(with);
     }

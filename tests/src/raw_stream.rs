@@ -35,18 +35,10 @@ impl RawStream {
 
     /// Opens a stream on a connection.
     pub async fn open_on(channel: Channel) -> Self {
-        Self::try_open_on(channel).await.unwrap()
-    }
-
-    /// Opens a stream on a connection that may be closing.
-    ///
-    /// # Errors
-    /// The call's status, where it is turned away before it is a stream.
-    pub async fn try_open_on(channel: Channel) -> Result<Self, Status> {
         let (requests, messages) = mpsc::channel(16);
         let mut client = IngestServiceClient::new(channel);
-        let answers = client.stream_observations(ReceiverStream::new(messages)).await?.into_inner();
-        Ok(Self { requests: Some(requests), answers })
+        let answers = client.stream_observations(ReceiverStream::new(messages)).await.unwrap().into_inner();
+        Self { requests: Some(requests), answers }
     }
 
     /// Opens a stream and a session.

@@ -21,7 +21,11 @@ use crate::{
         Pose, TangentCovariance,
         georeference::{Georeference, GeoreferenceFit},
     },
-    landmark::{Landmark, duplicate, index::LaneIndex},
+    landmark::{
+        Landmark, duplicate,
+        index::{LaneIndex, NearbyRun},
+        information::Knot,
+    },
     lane_map::{LaneId, LaneMap, LocalLane, LocalWindow},
     observation::{LaneObservation, observe},
     params::{Params, Preset},
@@ -136,8 +140,7 @@ impl Mapper {
         let detections: Vec<LaneShape> = observations
             .iter()
             .map(|observation| {
-                let points = observation.samples.iter().map(|sample| sample.point_vehicle).collect();
-                LaneShape::seen_once(observation.category, points, params.category_confusion)
+                LaneShape::seen_once(observation.category, observation.samples.clone(), params.category_confusion)
             })
             .collect();
         let sigma = |axis: usize| predicted.covariance[(axis, axis)].max(0.0).sqrt();
@@ -188,11 +191,11 @@ impl Mapper {
         self.seen_now.clear();
         for (observation, shape) in observations.iter().zip(lane_of) {
             let detection = observation.detection;
-            if let Some(lane) = shape.map(|shape| scene.runs[shape].lane) {
-                if self.extend_lane(lane, observation, frame.time()) {
-                    report.grown.push(lane);
+            if let Some(run) = shape.map(|shape| scene.runs[shape]) {
+                if self.extend_lane(&run, observation, frame.time()) {
+                    report.grown.push(run.lane);
                 }
-                report.associated.push(AssociatedDetection { detection, lane });
+                report.associated.push(AssociatedDetection { detection, lane: run.lane });
             } else if let Some(lane) = self.begin_lane(observation, frame.time()) {
                 report.born.push(AssociatedDetection { detection, lane });
             }
@@ -201,14 +204,14 @@ impl Mapper {
     }
 
     /// Takes an associated observation into its lane; whether the lane became longer.
-    fn extend_lane(&mut self, id: LaneId, observation: &LaneObservation, time: TimestampNs) -> bool {
-        let Some(lane) = self.lanes.get_mut(&id) else { return false };
+    fn extend_lane(&mut self, run: &NearbyRun, observation: &LaneObservation, time: TimestampNs) -> bool {
+        let Some(lane) = self.lanes.get_mut(&run.lane) else { return false };
         let params = &self.params.landmark;
         let grown = lane.grow(observation, &self.pose.map_from_vehicle, params);
-        Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, &self.sensor, &self.params);
-        self.seen_now.push(id);
-        let (first, last) = scene::near_knots(lane, &self.pose.map_from_vehicle, observation);
-        self.index.update(id, lane.information(), first, last);
+        let near = scene::near_knots(lane, run);
+        Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, near, &self.sensor, &self.params);
+        self.seen_now.push(run.lane);
+        self.index.update(run.lane, lane.information(), near.0, near.1);
         grown
     }
 
@@ -218,9 +221,9 @@ impl Mapper {
         let pose = &self.pose.map_from_vehicle;
         let mut lane = Landmark::begin(id, observation, pose, time, &self.params)?;
         self.last_lane += 1;
-        Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, &self.sensor, &self.params);
-        let (first, last) = lane.knots();
-        self.index.update(id, lane.information(), first, last);
+        let all = lane.knots();
+        Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, all, &self.sensor, &self.params);
+        self.index.update(id, lane.information(), all.0, all.1);
         self.lanes.insert(id, lane);
         self.seen_now.push(id);
         Some(id)
@@ -232,10 +235,10 @@ impl Mapper {
         observation: &LaneObservation,
         time: TimestampNs,
         map_from_vehicle: &Pose,
+        near: (Knot, Knot),
         sensor: &Sensor,
         params: &Params,
     ) {
-        let near = scene::near_knots(lane, map_from_vehicle, observation);
         let seconds = time.seconds_since(lane.last_seen);
         lane.smooth(observation, map_from_vehicle, seconds, near, params);
         let visibility =
@@ -284,13 +287,19 @@ impl Mapper {
         }
         let mut joined = Vec::new();
         for (position, old_run) in scene.runs.iter().enumerate() {
-            for young_run in &scene.runs[position + 1..] {
+            for (further, young_run) in scene.runs.iter().enumerate().skip(position + 1) {
                 let (old, young) = (old_run.lane, young_run.lane);
                 let (old_seen, young_seen) = (self.seen_now.contains(&old), self.seen_now.contains(&young));
                 if joined.contains(&old) || joined.contains(&young) || (!old_seen && !young_seen) {
                     continue;
                 }
-                if self.run_together(old_run, young_run) && self.judge_pair(old, young, old_seen && young_seen) {
+                // Two that are both seen only matter where they were suspected to be one.
+                if old_seen && young_seen && !self.is_rival(young, old) {
+                    continue;
+                }
+                if scene.may_run_together(position, further)
+                    && self.run_together(old_run, young_run)
+                    && self.judge_pair(old, young, old_seen && young_seen) {
                     self.join(old, young);
                     joined.push(young);
                 }
@@ -299,11 +308,15 @@ impl Mapper {
         joined
     }
 
-    fn run_together(&self, old: &crate::landmark::index::NearbyRun, young: &crate::landmark::index::NearbyRun) -> bool {
+    fn run_together(&self, old: &NearbyRun, young: &NearbyRun) -> bool {
         let (Some(a), Some(b)) = (self.lanes.get(&old.lane), self.lanes.get(&young.lane)) else { return false };
         let params = &self.params.landmark;
         let overlap = duplicate::overlap(b, (young.first, young.last), a, (old.first, old.last), params);
         overlap.is_some_and(|(share, distance_m)| share > 0.7 && distance_m < 0.6)
+    }
+
+    fn is_rival(&self, young: LaneId, old: LaneId) -> bool {
+        self.lanes.get(&young).is_some_and(|lane| lane.rival.is_some_and(|(rival, _)| rival == old))
     }
 
     fn judge_pair(&mut self, old: LaneId, young: LaneId, both_seen: bool) -> bool {

@@ -17,15 +17,6 @@ use crate::{
 use cubic::Cubic;
 use local_frame::LocalFrame;
 
-/// A sample of an observed lane.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ObservedPoint {
-    /// Position in the vehicle frame, metres.
-    pub point_vehicle: Point3<f64>,
-    /// Standard deviation of the detection there, metres.
-    pub sigma_m: f64,
-}
-
 /// A lane as one frame saw it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneObservation {
@@ -47,8 +38,8 @@ pub struct LaneObservation {
     pub certain: (f64, f64),
     /// Points that were measured and entered the fit.
     pub measured: usize,
-    /// Samples along the line from `reported.0` to `reported.1`.
-    pub samples: Vec<ObservedPoint>,
+    /// Samples along the line from `reported.0` to `reported.1`, vehicle frame, metres; [`sigma_at`] their range is their noise.
+    pub samples: Vec<Point3<f64>>,
 }
 
 impl LaneObservation {
@@ -68,7 +59,7 @@ impl LaneObservation {
 /// Standard deviation of a detection at a horizontal range from the camera.
 #[must_use]
 pub fn sigma_at(noise: &RangeNoise, range_m: f64) -> f64 {
-    noise.near_m + noise.growth_m * (range_m / noise.reference_range_m).powf(noise.exponent)
+    noise.near_m + noise.growth_m * (range_m / noise.reference_range_m).powi(noise.power)
 }
 
 /// Turns a detection into an observation; `None` where too little of it lies in the crop box.
@@ -114,7 +105,7 @@ pub fn observe(
         measured: points.len(),
         samples: Vec::new(),
     };
-    observation.samples = resample(&observation, params, range_m);
+    observation.samples = resample(&observation, params.sample_step_m);
     (observation.samples.len() >= params.least_samples).then_some(observation)
 }
 
@@ -187,20 +178,11 @@ fn fit_without_outliers(
 }
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a length within the crop box
-fn resample(
-    observation: &LaneObservation,
-    params: &ObservationParams,
-    range_m: impl Fn(&Point3<f64>) -> f64,
-) -> Vec<ObservedPoint> {
+fn resample(observation: &LaneObservation, step_m: f64) -> Vec<Point3<f64>> {
     let (from, to) = observation.reported;
-    let pieces = ((to - from) / params.sample_step_m).ceil().max(1.0) as usize;
+    let pieces = ((to - from) / step_m).ceil().max(1.0) as usize;
     let step = (to - from) / pieces as f64;
-    (0..=pieces)
-        .map(|k| {
-            let point_vehicle = observation.point_at(from + step * k as f64);
-            ObservedPoint { point_vehicle, sigma_m: sigma_at(&params.noise, range_m(&point_vehicle)) }
-        })
-        .collect()
+    (0..=pieces).map(|k| observation.point_at(from + step * k as f64)).collect()
 }
 
 #[cfg(test)]
@@ -229,9 +211,9 @@ mod tests {
         let observation = observe(&detection(points), 0, &Sensor::default(), &params()).unwrap();
         for sample in &observation.samples {
             // The cubic lives in the turned local frame: the same curve to a few centimetres.
-            assert!((sample.point_vehicle.y - curve(sample.point_vehicle.x)).abs() < 0.05);
+            assert!((sample.y - curve(sample.x)).abs() < 0.05);
         }
-        assert!(observation.samples[0].point_vehicle.x < observation.samples[1].point_vehicle.x);
+        assert!(observation.samples[0].x < observation.samples[1].x);
     }
 
     #[test]
@@ -247,7 +229,7 @@ mod tests {
         let mut points: Vec<Point3<f64>> = (0..40).map(|k| Point3::new(5.0 + f64::from(k), 2.0, 0.0)).collect();
         points[20].y = 5.0;
         let observation = observe(&detection(points), 0, &Sensor::default(), &params()).unwrap();
-        assert!(observation.samples.iter().all(|sample| (sample.point_vehicle.y - 2.0).abs() < 0.2));
+        assert!(observation.samples.iter().all(|sample| (sample.y - 2.0).abs() < 0.2));
     }
 
     #[test]

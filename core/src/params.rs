@@ -50,7 +50,7 @@ pub struct LineErrorParams {
     pub huber_sigmas: f64,
 }
 
-/// Standard deviation of a detection: `near + growth * (range / reference_range)^exponent`.
+/// Standard deviation of a detection: `near + growth * (range / reference_range)^power`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RangeNoise {
     /// At the camera, metres.
@@ -60,7 +60,7 @@ pub struct RangeNoise {
     /// Range at which the growth is reached, metres.
     pub reference_range_m: f64,
     /// 1: linear in range.
-    pub exponent: f64,
+    pub power: i32,
 }
 
 /// Parameters of [`crate::observation::observe`].
@@ -224,7 +224,7 @@ impl Params {
     /// The paper's numbers; where it gives none, its code's (`paper_notes.md`).
     fn paper() -> Self {
         // 0.1 m at the camera to 1.0 m at the far corner of the crop box, 51 m away.
-        let noise = RangeNoise { near_m: 0.1, growth_m: 0.9, reference_range_m: 51.0, exponent: 1.0 };
+        let noise = RangeNoise { near_m: 0.1, growth_m: 0.9, reference_range_m: 51.0, power: 1 };
         Self {
             preset: Preset::Paper,
             observation: ObservationParams {
@@ -278,7 +278,7 @@ impl Params {
     }
 
     fn mended() -> Self {
-        let noise = RangeNoise { near_m: 0.08, growth_m: 0.5, reference_range_m: 50.0, exponent: 1.5 };
+        let noise = RangeNoise { near_m: 0.08, growth_m: 0.5, reference_range_m: 50.0, power: 2 };
         Self {
             preset: Preset::Default,
             observation: ObservationParams {
@@ -302,7 +302,7 @@ impl Params {
                 least_sigma_m: 0.05,
                 least_bound_m: 1.0,
                 bound_noise_m: 0.5,
-                noise: RangeNoise { near_m: 0.15, growth_m: 0.5, reference_range_m: 50.0, exponent: 1.0 },
+                noise: RangeNoise { near_m: 0.15, growth_m: 0.5, reference_range_m: 50.0, power: 1 },
                 witnesses: 3.0,
                 unassigned_cost: 12.0,
                 missed_cost: 1.0,

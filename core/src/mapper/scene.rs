@@ -1,6 +1,6 @@
 //! The part of the map that a frame can see: nearby lanes, as the stages of a step want them.
 
-use std::{cell::RefCell, collections::BTreeMap};
+use std::collections::BTreeMap;
 
 use nalgebra::{Point3, Vector3, Vector6};
 
@@ -25,8 +25,8 @@ use crate::{
 const RADIUS_M: f64 = 55.0;
 /// The middle of the view, metres ahead of the vehicle.
 const MIDDLE_M: f64 = 28.0;
-/// Samples of a lane per chord, for association.
-const PIECES_PER_CHORD: usize = 2;
+/// Samples of a lane per chord, for association, which compares with the tangent at the nearest sample.
+const PIECES_PER_CHORD: usize = 1;
 
 /// Nearby lanes in the order of their ids.
 pub(super) struct Scene {
@@ -56,6 +56,14 @@ impl Scene {
         Self { runs, shapes }
     }
 
+    /// Whether the middles of two lanes lie near each other, which all duplicates' do.
+    pub fn may_run_together(&self, a: usize, b: usize) -> bool {
+        let (a, b) = (&self.shapes[a], &self.shapes[b]);
+        let (short, long) = if a.points.len() < b.points.len() { (a, b) } else { (b, a) };
+        let middle = &short.points[short.points.len() / 2];
+        (long.points[long.nearest(middle)] - middle).norm() < 2.0
+    }
+
     /// Matched observations with the foot points of their samples, for the pose update.
     pub fn matched_lanes<'a>(
         &self,
@@ -74,12 +82,11 @@ impl Scene {
             let step = (params.tracking.point_step_m / params.observation.sample_step_m).round().max(1.0);
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a small positive stride
             let points: Vec<Point3<f64>> =
-                observation.samples.iter().step_by(step as usize).map(|sample| sample.point_vehicle).collect();
+                observation.samples.iter().step_by(step as usize).copied().collect();
             let run = shape.map(|shape| self.runs[shape]);
             let near = run.map_or_else(|| lane.knots(), |run| (run.first, run.last));
-            let hints = RefCell::new(Vec::new());
             let query = points.clone();
-            let foot_points = Box::new(move |pose: &Pose| correspondences(lane, near, &query, pose, params, &hints));
+            let foot_points = Box::new(move |pose: &Pose| correspondences(lane, near, &query, pose, params));
             matched.push(MatchedLane { points_vehicle: points, foot_points });
         }
         matched
@@ -92,7 +99,6 @@ fn correspondences(
     points: &[Point3<f64>],
     pose: &Pose,
     params: &Params,
-    _hints: &RefCell<Vec<f64>>,
 ) -> Vec<Option<Correspondence>> {
     let Some(curve) = lane.curve(params.landmark.ends) else { return vec![None; points.len()] };
     let mut walk = FootWalk::new(lane, &curve, near, &params.landmark);
@@ -100,10 +106,11 @@ fn correspondences(
         .iter()
         .map(|point| {
             let foot = walk.foot_point(&(pose * point))?;
-            let tangent_map = curve.derivative(foot.parameter).try_normalize(1e-9)?;
+            let (foot_map, derivative, _) = curve.segment_at(foot.parameter).evaluate(foot.parameter);
+            let tangent_map = derivative.try_normalize(1e-9)?;
             let head = lane.information().head() as f64;
             let map_variance = lane.extent.variance_at(head + foot.parameter).min(10.0);
-            Some(Correspondence { foot_map: curve.point(foot.parameter), tangent_map, map_variance })
+            Some(Correspondence { foot_map, tangent_map, map_variance })
         })
         .collect()
 }
@@ -128,13 +135,12 @@ pub(super) fn displaced(map_from_vehicle: &Pose, error: &Vector3<f64>) -> Pose {
     perturb(map_from_vehicle, &Vector6::new(-error.x, -error.y, 0.0, 0.0, 0.0, -error.z))
 }
 
-/// Knots of a lane between which an observation lies, by the ends of the observation.
-pub(super) fn near_knots(lane: &Landmark, map_from_vehicle: &Pose, observation: &LaneObservation) -> (Knot, Knot) {
-    let last = lane.positions().len() - 1;
-    let index_near = |x: f64| lane.nearest_index(&(map_from_vehicle * observation.point_at(x)), 0, last);
-    let (a, b) = (index_near(observation.reported.0), index_near(observation.reported.1));
-    let (low, high) = (a.min(b).saturating_sub(4), (a.max(b) + 4).min(last));
-    (lane.information().knot(low), lane.information().knot(high))
+/// Knots of a lane between which an observation lies: those near the vehicle, and what the lane has just grown by.
+pub(super) fn near_knots(lane: &Landmark, run: &NearbyRun) -> (Knot, Knot) {
+    /// A crop box is shorter than this many chords.
+    const GROWTH: Knot = 24;
+    let (first, last) = lane.knots();
+    ((run.first - GROWTH).max(first), (run.last + GROWTH).min(last))
 }
 
 /// How surely the detector would report a line that runs through a place (vehicle frame), in `[0, 1]`.

@@ -121,7 +121,8 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
     /// Segment and position on it; parameters beyond the ends stay on the first or last segment.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // floored, and clamped to the segments
     fn locate(&self, parameter: f64) -> (usize, f64) {
-        let segment = (parameter.floor().max(0.0) as usize).clamp(self.first_segment(), self.last_segment());
+        // A cast of a negative number is 0, and truncation is the floor of all others.
+        let segment = (parameter as usize).clamp(self.first_segment(), self.last_segment());
         (segment, parameter - segment as f64)
     }
 
@@ -173,6 +174,25 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
         self.combine(&self.fold(segment, basis::second_derivative_weights(u)))
     }
 
+    /// The segment that holds a parameter, ready to be evaluated many times.
+    #[must_use]
+    pub fn segment_at(&self, parameter: f64) -> Segment {
+        let (segment, _) = self.locate(parameter);
+        let count = self.points.count();
+        let (start, end) = (self.points.at(segment).coords, self.points.at(segment + 1).coords);
+        let before = if segment > 0 { self.points.at(segment - 1).coords } else { start * 2.0 - end };
+        let after = if segment + 2 < count { self.points.at(segment + 2).coords } else { end * 2.0 - start };
+        Segment {
+            start: segment as f64,
+            coefficients: [
+                start,
+                (end - before) * 0.5,
+                before - start * 2.5 + end * 2.0 - after * 0.5,
+                (start - end) * 1.5 + (after - before) * 0.5,
+            ],
+        }
+    }
+
     fn combine(&self, support: &Support) -> Vector3<f64> {
         let mut sum = Vector3::zeros();
         for (k, weight) in support.weights.iter().enumerate() {
@@ -181,6 +201,31 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
             }
         }
         sum
+    }
+}
+
+/// One segment as a polynomial in its own `u`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Segment {
+    start: f64,
+    coefficients: [Vector3<f64>; 4],
+}
+
+impl Segment {
+    /// Whether a parameter lies on this segment.
+    #[must_use]
+    pub fn holds(&self, parameter: f64) -> bool {
+        (0.0..=1.0).contains(&(parameter - self.start))
+    }
+
+    /// Point, first and second derivative at a parameter of the curve.
+    #[must_use]
+    pub fn evaluate(&self, parameter: f64) -> (Point3<f64>, Vector3<f64>, Vector3<f64>) {
+        let u = parameter - self.start;
+        let [c0, c1, c2, c3] = &self.coefficients;
+        let point = c0 + (c1 + (c2 + c3 * u) * u) * u;
+        let derivative = c1 + (c2 * 2.0 + c3 * (3.0 * u)) * u;
+        (point.into(), derivative, c2 * 2.0 + c3 * (6.0 * u))
     }
 }
 
@@ -230,6 +275,10 @@ mod tests {
             let second = (curve.derivative(parameter + h) - curve.derivative(parameter - h)) / (2.0 * h);
             assert!((first - curve.derivative(parameter)).norm() < 1e-7);
             assert!((second - curve.second_derivative(parameter)).norm() < 1e-6);
+            let (point, derivative, bend) = curve.segment_at(parameter).evaluate(parameter);
+            assert!((point - curve.point(parameter)).norm() < 1e-12);
+            assert!((derivative - curve.derivative(parameter)).norm() < 1e-12);
+            assert!((bend - curve.second_derivative(parameter)).norm() < 1e-12);
         }
     }
 }

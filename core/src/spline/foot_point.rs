@@ -5,7 +5,7 @@
 //! and the foot point on the polyline gives `u` ([`foot_point_coarse`]).
 //!
 //! Ours ([`foot_point_refined`]): from any starting parameter, Newton on `|p(t) - q|^2`, walking over segment borders,
-//! until the step is below a micrometre: `t += <q - p, p'> / (|p'|^2 - <q - p, p''>)`, with the curvature term left out
+//! until the step is below a tenth of a millimetre: `t += <q - p, p'> / (|p'|^2 - <q - p, p''>)`, with the curvature term left out
 //! where it would make the denominator small. Not guaranteed: the global minimum on a curve that doubles back within
 //! a few chords of the start.
 
@@ -78,31 +78,38 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
     start: f64,
 ) -> Option<FootPoint> {
     const ITERATIONS: usize = 12;
+    /// Steps shorter than this are not taken, control points.
+    const SETTLED: f64 = 3e-5;
     /// Steps longer than this leave the neighbourhood in which the parabola is believed, control points.
     const LONGEST_STEP: f64 = 8.0;
     let (first, last) = (curve.first_parameter(), curve.last_parameter());
     let mut parameter = start.clamp(first, last);
+    let mut segment = curve.segment_at(parameter);
+    let mut nearest = *query;
     for _ in 0..ITERATIONS {
-        let offset = query - curve.point(parameter);
-        let derivative = curve.derivative(parameter);
+        if !segment.holds(parameter) {
+            segment = curve.segment_at(parameter);
+        }
+        let (point, derivative, bend) = segment.evaluate(parameter);
+        nearest = point;
+        let offset = query - point;
         let speed_squared = derivative.norm_squared();
         if speed_squared < 1e-12 {
             return None;
         }
         let gradient = offset.dot(&derivative);
-        let curvature = offset.dot(&curve.second_derivative(parameter));
+        let curvature = offset.dot(&bend);
         let step = (gradient / (speed_squared - curvature).max(0.5 * speed_squared)).clamp(-LONGEST_STEP, LONGEST_STEP);
-        let moved = (parameter + step).clamp(first, last);
         if (parameter <= first && step < 0.0) || (parameter >= last && step > 0.0) {
             return None;
         }
-        let settled = (moved - parameter).abs() < 1e-7;
-        parameter = moved;
-        if settled {
+        // Below a tenth of a millimetre along the curve the distance no longer changes.
+        if step.abs() < SETTLED {
             break;
         }
+        parameter = (parameter + step).clamp(first, last);
     }
-    Some(FootPoint { parameter, distance_m: (query - curve.point(parameter)).norm() })
+    Some(FootPoint { parameter, distance_m: (query - nearest).norm() })
 }
 
 #[cfg(test)]

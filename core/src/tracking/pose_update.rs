@@ -56,9 +56,10 @@ pub fn update_pose(
 ) -> PoseEstimate {
     let shown = perturb(&predicted.map_from_vehicle, &predicted.detector_error);
     let start = perturb(start, &predicted.detector_error);
-    let with_fresh_error = refresh_detector_error(predicted, &Normal::lanes_at(lanes, &start, params).hessian, params);
+    let at_start = Normal::lanes_at(lanes, &start, params);
+    let with_fresh_error = refresh_detector_error(predicted, &at_start.hessian, params);
     let Some(prior) = Prior::new(&with_fresh_error, &shown) else { return *predicted };
-    let (found, found_covariance) = minimise(&prior, start, lanes, params);
+    let (found, found_covariance) = minimise(&prior, start, at_start, lanes, params);
     share_out(&with_fresh_error, &prior, &found, &found_covariance)
 }
 
@@ -66,16 +67,22 @@ pub fn update_pose(
 fn minimise(
     prior: &Prior,
     start: Pose,
+    at_start: Normal,
     lanes: &[MatchedLane<'_>],
     params: &TrackingParams,
 ) -> (Pose, TangentCovariance) {
     let mut pose = start;
     let mut damping = 0.0;
-    let mut current = Normal::of(lanes, &pose, prior, params);
+    let mut current = at_start.with_prior(&pose, prior, params);
     for _ in 0..params.iterations {
         let Some(step) = current.step(damping) else { break };
         let moved = perturb(&pose, &step);
-        let next = Normal::of(lanes, &moved, prior, params);
+        // So small a step moves no foot point: the linearisation still holds.
+        if is_settled(&step) {
+            pose = moved;
+            break;
+        }
+        let next = Normal::lanes_at(lanes, &moved, params).with_prior(&moved, prior, params);
         if next.cost > current.cost * (1.0 + 1e-9) {
             damping = (damping * 10.0f64).max(1e-3);
             continue;
@@ -83,11 +90,13 @@ fn minimise(
         pose = moved;
         current = next;
         damping *= 0.1;
-        if step.fixed_rows::<3>(0).norm() < 1e-3 && step.fixed_rows::<3>(3).norm() < 1e-5 {
-            break;
-        }
     }
     (pose, current.hessian.cholesky().map_or(prior.covariance, |factor| factor.inverse()))
+}
+
+/// Below 5 mm and 0.1 mrad a step is not worth another look at the lanes.
+fn is_settled(step: &Vector6<f64>) -> bool {
+    step.fixed_rows::<3>(0).norm() < 5e-3 && step.fixed_rows::<3>(3).norm() < 1e-4
 }
 
 /// Brings the detector's error to its stationary covariance `C = H^-1` where the lanes say anything: `+ (1 - phi^2) C`.
@@ -161,17 +170,16 @@ struct Normal {
 }
 
 impl Normal {
-    /// The lanes and the prior.
-    fn of(lanes: &[MatchedLane<'_>], pose: &Pose, prior: &Prior, params: &TrackingParams) -> Self {
-        let lanes = Self::lanes_at(lanes, pose, params);
+    /// The lanes at a pose, and the prior.
+    fn with_prior(&self, pose: &Pose, prior: &Prior, params: &TrackingParams) -> Self {
         // With the lines' common error in the state, what is left in a frame is white and small.
         let sharpen = if params.correlation_s > 0.0 { params.sharpness } else { 1.0 };
         let deviation = log(&(prior.predicted_from_map * pose));
         let pull = prior.information * deviation;
         Self {
-            hessian: lanes.hessian * sharpen + prior.information,
-            gradient: lanes.gradient * sharpen + pull,
-            cost: lanes.cost * sharpen + deviation.dot(&pull),
+            hessian: self.hessian * sharpen + prior.information,
+            gradient: self.gradient * sharpen + pull,
+            cost: self.cost * sharpen + deviation.dot(&pull),
         }
     }
 
@@ -184,7 +192,7 @@ impl Normal {
             normals += normals_of(&feet, pose);
             for axis in [Axis::Lateral, Axis::Vertical] {
                 let sums = LineSums::of(axis, &lane.points_vehicle, &feet, pose, params);
-                let (h, g, c) = sums.without_line_error(axis, params);
+                let (h, g, c) = sums.without_line_error(params);
                 hessian += h;
                 gradient += g;
                 cost += c;
@@ -259,8 +267,7 @@ impl LineSums {
     }
 
     /// Hessian, gradient and cost with the line's own error polynomial eliminated.
-    fn without_line_error(&self, axis: Axis, params: &TrackingParams) -> (Matrix6<f64>, Vector6<f64>, f64) {
-        let _ = axis;
+    fn without_line_error(&self, params: &TrackingParams) -> (Matrix6<f64>, Vector6<f64>, f64) {
         let prior = line_sigmas(params).map(|sigma| 1.0 / (sigma * sigma).max(1e-12));
         let Some(factor) = (self.bb + Matrix3::from_diagonal(&prior)).cholesky() else {
             return (self.jj, self.je, self.ee);
@@ -441,7 +448,7 @@ mod tests {
             })
             .collect();
         let (hessian, gradient, _) =
-            LineSums::of(Axis::Lateral, &points, &feet, &pose, &params).without_line_error(Axis::Lateral, &params);
+            LineSums::of(Axis::Lateral, &points, &feet, &pose, &params).without_line_error(&params);
         let n = points.len();
         let jacobian = nalgebra::DMatrix::from_fn(n, 6, |k, c| residual_jacobian(&pose, &points[k], &Vector3::y())[c]);
         let residual = nalgebra::DVector::from_element(n, 0.1);

@@ -299,7 +299,8 @@ impl Mapper {
                 }
                 if scene.may_run_together(position, further)
                     && self.run_together(old_run, young_run)
-                    && self.judge_pair(old, young, old_seen && young_seen) {
+                    && self.judge_pair(old, young, old_seen && young_seen)
+                {
                     self.join(old, young);
                     joined.push(young);
                 }

@@ -81,8 +81,7 @@ impl Scene {
             }
             let step = (params.tracking.point_step_m / params.observation.sample_step_m).round().max(1.0);
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a small positive stride
-            let points: Vec<Point3<f64>> =
-                observation.samples.iter().step_by(step as usize).copied().collect();
+            let points: Vec<Point3<f64>> = observation.samples.iter().step_by(step as usize).copied().collect();
             let run = shape.map(|shape| self.runs[shape]);
             let near = run.map_or_else(|| lane.knots(), |run| (run.first, run.last));
             let query = points.clone();

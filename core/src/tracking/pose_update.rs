@@ -32,12 +32,15 @@ pub struct Correspondence {
     pub map_variance: f64,
 }
 
+/// Foot points of a detection's points at a pose, in their order; `None` for a point beyond the lane's ends.
+pub type FootPoints<'a> = Box<dyn Fn(&Pose) -> Vec<Option<Correspondence>> + 'a>;
+
 /// A detection that was taken for a lane: its points, and how to find their foot points.
 pub struct MatchedLane<'a> {
     /// Points of the observation, vehicle frame, metres.
     pub points_vehicle: Vec<Point3<f64>>,
-    /// Foot points of the points at a pose, in their order; `None` for a point beyond the lane's ends.
-    pub foot_points: Box<dyn Fn(&Pose) -> Vec<Option<Correspondence>> + 'a>,
+    /// How its points find their foot points.
+    pub foot_points: FootPoints<'a>,
 }
 
 /// Range at which the bend of a line's error is quoted, metres.
@@ -59,7 +62,7 @@ pub fn update_pose(
     let at_start = Normal::lanes_at(lanes, &start, params);
     let with_fresh_error = refresh_detector_error(predicted, &at_start.hessian, params);
     let Some(prior) = Prior::new(&with_fresh_error, &shown) else { return *predicted };
-    let (found, found_covariance) = minimise(&prior, start, at_start, lanes, params);
+    let (found, found_covariance) = minimise(&prior, start, &at_start, lanes, params);
     share_out(&with_fresh_error, &prior, &found, &found_covariance)
 }
 
@@ -67,7 +70,7 @@ pub fn update_pose(
 fn minimise(
     prior: &Prior,
     start: Pose,
-    at_start: Normal,
+    at_start: &Normal,
     lanes: &[MatchedLane<'_>],
     params: &TrackingParams,
 ) -> (Pose, TangentCovariance) {

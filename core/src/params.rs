@@ -349,7 +349,7 @@ impl Params {
                 drawn_share: 0.5,
                 sure_range_m: 25.0,
                 blind_range_m: 41.0,
-                shown_existence: 0.7,
+                shown_existence: 0.6,
                 shown_in_image_m: 8.0,
                 shown_in_window_m: 5.0,
             },

@@ -8,7 +8,7 @@
 use serde::{Deserialize, Serialize};
 
 /// Chance that a ghost is reported again in the next frame.
-const FALSE_REPORT: f64 = 0.3;
+const FALSE_REPORT: f64 = 0.45;
 /// Frames of one burst count as this share of independent ones.
 const INDEPENDENCE: f64 = 0.5;
 /// Log-odds stay within `+-` this, so that what vanished can be given up.

@@ -201,6 +201,7 @@ mod tests {
         // White noise is left out of the correlation in time; with little of it the two agree.
         let params = LineErrorParams {
             white_sigma_m: 0.02,
+            sigmas_m: [0.1, 0.25, 0.4],
             huber_sigmas: f64::INFINITY,
             ..Params::preset(Preset::Default).line_error
         };

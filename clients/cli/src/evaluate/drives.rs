@@ -11,9 +11,9 @@ use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
 use super::CommonArgs;
 
-/// What a vehicle states of a motion that has no error: 1 cm and 0.01 degrees.
-const RESIDUAL_M: f64 = 0.01;
-const RESIDUAL_DEG: f64 = 0.01;
+/// What a vehicle states of a motion that has no error: 1 mm and 0.001 degrees.
+const RESIDUAL_M: f64 = 0.001;
+const RESIDUAL_DEG: f64 = 0.001;
 
 /// Noise of the odometry between every two frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

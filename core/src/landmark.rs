@@ -4,6 +4,7 @@ pub mod category;
 pub mod duplicate;
 pub mod existence;
 pub mod extent;
+pub mod foot_walk;
 pub mod growth;
 pub mod index;
 pub mod information;

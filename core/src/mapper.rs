@@ -5,8 +5,6 @@
 
 mod local_map;
 mod scene;
-#[cfg(test)]
-mod tests;
 
 use std::collections::BTreeMap;
 

@@ -1,6 +1,6 @@
 //! The paper's association: bounded Chamfer distance, lateral consistency, Kuhn-Munkres.
 //!
-//! Paper: "Lane association", with `paper_notes.md` 3:
+//! Paper: "Lane association", with its misprints corrected:
 //! `delta_k = 2 |p_k| sin(2 sigma_theta / 2) + 2 sigma_t + 2 sigma_k`,
 //! `d_ji = sqrt(M / n_a) * mean of d_k over the n_a points with d_k < delta_k`, an edge where
 //! `d_ji < sqrt(2) mean(delta_k)` and the categories agree, and the weight `(1 / d_ji) S`.

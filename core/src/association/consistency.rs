@@ -1,6 +1,6 @@
 //! Lateral sequence consistency: do two associations agree on which lane lies left of which, and how far?
 //!
-//! Paper: "Lane association", figure 3, with `paper_notes.md` 3. For the associations `(i -> j)` and `(k -> l)` the middle point of
+//! Paper: "Lane association", figure 3, with its misprints corrected. For the associations `(i -> j)` and `(k -> l)` the middle point of
 //! one lane is compared with the chord of the other, once in the frame and once in the map: on the same side they add
 //! `1 / (1 + |difference of distances|)` to each other's score (the paper's `1 / |.|` blows up). Associations that share a
 //! detection or a lane are inconsistent. Scores are divided by their maximum and squared.

@@ -1,11 +1,11 @@
 //! Two lanes of the map that are one line of the road: found by their distance, told from a double line by who sees them.
 //!
-//! Ours (`paper_notes.md` 8); the authors delete the shorter of two lanes that overlap within 1.75 m, at the end of the drive,
+//! Ours; the authors delete the shorter of two lanes that overlap within 1.75 m, at the end of the drive,
 //! so that real neighbours die. Here a younger lane that runs along an older one is its duplicate only if the detector
 //! shows one *or* the other: frames that show one alone speak for it, frames that show both speak against it. The younger
 //! lane's information is added to the older one; nothing is deleted.
 
-use super::{Landmark, information::Knot, lane::FootWalk};
+use super::{Landmark, foot_walk::FootWalk, information::Knot};
 use crate::{lane_map::LaneId, params::LandmarkParams};
 
 /// Frames that must speak for a duplicate, net of those against.

@@ -1,6 +1,6 @@
 //! Whether a lane exists: log-odds that a sighting raises and a miss lowers.
 //!
-//! Ours (`paper_notes.md` 8); the paper counts sightings six frames after birth. With `p_d` the chance that the detector
+//! Ours; the paper counts sightings six frames after birth. With `p_d` the chance that the detector
 //! reports a real line and `p_f` that it reports one that is not there,
 //! seen: `+ ln(p_d / p_f)`, missed while in view: `+ ln((1 - p_d) / (1 - p_f))`, not in view: nothing. Frames are
 //! correlated (misses and ghosts come in bursts), so each step is taken with `INDEPENDENCE` of its weight.

@@ -1,6 +1,6 @@
 //! Growing a lane: new control points, one chord apart, on the line that a frame observed.
 //!
-//! Paper: "Lane Initialization", Algorithm 1, with the corrections of `paper_notes.md` 6. The next control point is the
+//! Paper: "Lane Initialization", Algorithm 1, with its misprints corrected. The next control point is the
 //! intersection of the sphere of one chord around the end with the observed cubic, by fixed-point iteration between the
 //! two. Only what lies beyond the end's normal plane counts.
 //!

@@ -2,7 +2,7 @@
 //!
 //! Paper: "Spline Optimization". Every sample of an associated observation adds a point-to-spline term
 //! `r_k = T p_k - p(u_k)`, weighted by its range and Huber's kernel; neighbouring control points are tied by chordal terms
-//! as initialised. `default` differs in three things (`paper_notes.md` 4, 7): the samples of one line in one frame share the
+//! as initialised. `default` differs in three things: the samples of one line in one frame share the
 //! information of a few witnesses, second differences are held small, and the last frames' foot points and weights are
 //! evaluated anew before they are folded into the information for good (fluid relinearisation in a window).
 
@@ -15,6 +15,7 @@ use super::{
     category::CategoryBelief,
     existence::Existence,
     extent::{Extent, Sighting},
+    foot_walk::FootWalk,
     growth::{self, GrowthRule},
     information::{BandedInformation, BandedSum, Knot, Term},
     line_terms::{ControlPointAt, LineSample, PlacedSample, line_terms},
@@ -25,7 +26,7 @@ use crate::{
     lane_map::{EndRule, LaneId},
     observation::{LaneObservation, sigma_at},
     params::{LandmarkParams, Params},
-    spline::{Curve, FootPoint, foot_point_coarse, foot_point_refined},
+    spline::Curve,
 };
 
 /// Holds a new lane together until it has data: information of its first control point, 1/m^2.
@@ -443,64 +444,6 @@ impl Landmark {
             extent.absorb(&other.extent, to_mine);
         }
         self.extent = extent;
-    }
-}
-
-/// Foot points of samples in the order along a lane, each search starting where the last one ended.
-pub struct FootWalk<'a> {
-    lane: &'a Landmark,
-    curve: &'a Curve<'a, VecDeque<Point3<f64>>>,
-    near: (usize, usize),
-    ends: EndRule,
-    chord_m: f64,
-    last: Option<f64>,
-}
-
-impl<'a> FootWalk<'a> {
-    /// A walk along a lane between two knots.
-    #[must_use]
-    pub fn new(
-        lane: &'a Landmark,
-        curve: &'a Curve<'a, VecDeque<Point3<f64>>>,
-        near: (Knot, Knot),
-        params: &LandmarkParams,
-    ) -> Self {
-        let near = (lane.index_of(near.0), lane.index_of(near.1));
-        Self { lane, curve, near, ends: params.ends, chord_m: params.chord_m, last: None }
-    }
-
-    /// Foot point of the next sample; `None` beyond the lane's ends.
-    pub fn foot_point(&mut self, query: &Point3<f64>) -> Option<FootPoint> {
-        match self.ends {
-            EndRule::Open => {
-                let nearest = self.lane.nearest_index(query, self.near.0, self.near.1);
-                foot_point_coarse(self.curve, query, nearest, self.chord_m)
-            }
-            EndRule::Reflected => {
-                let start = self.start(query);
-                let foot = foot_point_refined(self.curve, query, start);
-                self.last = foot.map(|foot| foot.parameter).or(self.last);
-                foot
-            }
-        }
-    }
-
-    /// Parameter of the foot point, or of the end beyond which the query lies.
-    pub fn nearest_parameter(&mut self, query: &Point3<f64>) -> f64 {
-        let start = self.start(query);
-        let (first, last) = (self.curve.first_parameter(), self.curve.last_parameter());
-        foot_point_refined(self.curve, query, start).map_or_else(
-            || {
-                let to_first = (self.curve.point(first) - query).norm_squared();
-                let to_last = (self.curve.point(last) - query).norm_squared();
-                if to_first < to_last { first } else { last }
-            },
-            |foot| foot.parameter,
-        )
-    }
-
-    fn start(&self, query: &Point3<f64>) -> f64 {
-        self.last.unwrap_or_else(|| self.lane.nearest_index(query, self.near.0, self.near.1) as f64)
     }
 }
 

@@ -9,9 +9,9 @@ use crate::{
     geometry::{Pose, pose::perturb},
     landmark::{
         Landmark,
+        foot_walk::FootWalk,
         index::{LaneIndex, NearbyRun, STALE_M},
         information::Knot,
-        lane::FootWalk,
     },
     lane_map::LaneId,
     observation::LaneObservation,

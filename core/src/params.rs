@@ -221,7 +221,7 @@ impl Params {
         }
     }
 
-    /// The paper's numbers; where it gives none, its code's (`paper_notes.md`).
+    /// The paper's numbers; where it gives none, its code's.
     fn paper() -> Self {
         // 0.1 m at the camera to 1.0 m at the far corner of the crop box, 51 m away.
         let noise = RangeNoise { near_m: 0.1, growth_m: 0.9, reference_range_m: 51.0, power: 1 };

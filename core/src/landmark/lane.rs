@@ -2,9 +2,9 @@
 //!
 //! Paper: "Spline Optimization". Every sample of an associated observation adds a point-to-spline term
 //! `r_k = T p_k - p(u_k)`, weighted by its range and Huber's kernel; neighbouring control points are tied by chordal terms
-//! as initialised. `default` differs in three things: the samples of one line in one frame share the
-//! information of a few witnesses, second differences are held small, and the last frames' foot points and weights are
-//! evaluated anew before they are folded into the information for good (fluid relinearisation in a window).
+//! as initialised. `default` differs in three things: the samples of one line err together (`line_terms`), second
+//! differences are held small, and the last frames' foot points and weights are evaluated anew before they are folded
+//! into the information for good (fluid relinearisation in a window).
 
 use std::collections::VecDeque;
 

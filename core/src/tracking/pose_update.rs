@@ -2,7 +2,7 @@
 //!
 //! Paper: "Pose Update": minimise `sum rho(|(I - d d^T)(T p_k - p(u_k))|^2) + |log(T_odo^-1 T)|^2_P` over SE(3), `d` the unit
 //! tangent. Levenberg-Marquardt, foot points found anew at every iteration, Huber's kernel, the odometry term weighted
-//! by its covariance, and the covariance of the result from the final Hessian (`paper_notes.md` 4).
+//! by its covariance, and the covariance of the result from the final Hessian.
 //!
 //! Where we differ: a hundred points along one line are not a hundred measurements. A line's error in one frame is
 //! `B a + white`, `B = [1, r, (r / r_0)^2]` in the range `r`, `a ~ N(0, S)`, sideways and in height. The `a` are eliminated in closed

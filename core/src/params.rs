@@ -193,6 +193,12 @@ pub struct LandmarkParams {
     pub huber_m: f64,
     /// Frames whose weights and foot points are evaluated anew before they are folded for good.
     pub window_frames: usize,
+    /// Factor on the variance of published control points. What a detector repeats in every frame of a line (a constant
+    /// share of its error, a yaw that all lines share) is not averaged away by more frames, and the smoother, which knows
+    /// only errors that fade, takes it for averaged. On 24 simulated drives on true poses (12 seeds, town and long road,
+    /// 19,000 control points) the 95 % region across the line held the truth 73 % of the time without this factor, and
+    /// 95.1 % with 6.25, which is 2.5 times the standard deviation.
+    pub variance_inflation: f64,
     /// Lanes seen in fewer frames than this are not shown.
     pub least_observations: u32,
     /// Noise of a detection, as it weighs in the map.
@@ -264,6 +270,7 @@ impl Params {
                 witnesses: 1e6,
                 huber_m: 0.5,
                 window_frames: 0,
+                variance_inflation: 1.0,
                 least_observations: 4,
                 noise,
                 drawn_share: 0.0,
@@ -344,6 +351,7 @@ impl Params {
                 witnesses: 1.0,
                 huber_m: 0.8,
                 window_frames: 3,
+                variance_inflation: 6.25,
                 least_observations: 3,
                 noise,
                 drawn_share: 0.5,

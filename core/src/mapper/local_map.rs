@@ -37,7 +37,10 @@ pub(super) fn map_lane(lane: &Landmark, params: &Params) -> Option<MapLane> {
         .positions()
         .iter()
         .zip(variances)
-        .map(|(position, variance)| ControlPoint { position: *position, covariance: Matrix3::identity() * variance })
+        .map(|(position, variance)| ControlPoint {
+            position: *position,
+            covariance: Matrix3::identity() * (variance * params.landmark.variance_inflation),
+        })
         .collect();
     Some(MapLane {
         id: lane.id,

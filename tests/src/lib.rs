@@ -8,3 +8,4 @@ pub mod drives;
 pub mod folders;
 pub mod raw_stream;
 pub mod servers;
+pub mod simulated;

@@ -21,6 +21,7 @@ use crate::{
     },
     landmark::{
         Landmark, duplicate,
+        existence::DETECTION,
         index::{LaneIndex, NearbyRun},
         information::Knot,
     },
@@ -33,7 +34,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 2;
+const SNAPSHOT_VERSION: u16 = 3;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -45,6 +46,8 @@ pub struct Mapper {
     odometry_from_vehicle: Option<Pose>,
     /// Time of the last frame.
     time: TimestampNs,
+    /// Frames taken.
+    frames: u64,
     lanes: BTreeMap<LaneId, Landmark>,
     index: LaneIndex,
     last_lane: u64,
@@ -91,6 +94,7 @@ impl Mapper {
             pose: PoseEstimate::first(Pose::identity()),
             odometry_from_vehicle: None,
             time: TimestampNs(0),
+            frames: 0,
             lanes: BTreeMap::new(),
             index: LaneIndex::default(),
             last_lane: 0,
@@ -120,6 +124,7 @@ impl Mapper {
         let previous = self.odometry_from_vehicle.replace(odometry.odometry_from_vehicle);
         let seconds = frame.time().seconds_since(self.time);
         self.time = frame.time();
+        self.frames += 1;
         match previous {
             Some(previous) => self.pose.predict(&previous, odometry, seconds, &self.params.tracking),
             None => PoseEstimate::first(odometry.odometry_from_vehicle),
@@ -218,6 +223,7 @@ impl Mapper {
         let id = LaneId(self.last_lane + 1);
         let pose = &self.pose.map_from_vehicle;
         let mut lane = Landmark::begin(id, observation, pose, time, &self.params)?;
+        lane.born_at_frame = self.frames;
         self.last_lane += 1;
         let all = lane.knots();
         Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, all, &self.sensor, &self.params);
@@ -243,7 +249,7 @@ impl Mapper {
             |point: &Point3<f64>| scene::visibility(&map_from_vehicle.inverse_transform_point(point), sensor, params);
         lane.vote_extent(observation, map_from_vehicle, near, visibility, &params.landmark);
         lane.category.vote(observation.category);
-        lane.existence.seen(0.85);
+        lane.existence.seen(DETECTION);
         lane.observations += 1;
         lane.last_seen = time;
     }
@@ -251,7 +257,7 @@ impl Mapper {
     /// Lowers the existence of lanes that this frame should have seen, and gives up those that are not there.
     fn judge_existence(&mut self, scene: &Scene) -> Vec<LaneId> {
         if self.params.preset == Preset::Paper {
-            return Vec::new();
+            return self.end_trials(scene);
         }
         let mut dropped = Vec::new();
         for run in &scene.runs {
@@ -262,10 +268,24 @@ impl Mapper {
             let chance =
                 scene::detection_probability(lane, run, &self.pose.map_from_vehicle, &self.sensor, &self.params);
             lane.existence.missed(chance);
-            if lane.existence.probability() < 0.05 {
+            if lane.existence.is_given_up() {
                 dropped.push(run.lane);
             }
         }
+        for id in &dropped {
+            self.forget(*id);
+        }
+        dropped
+    }
+
+    /// The authors' rule: a lane that few frames saw by the end of its trial is given up.
+    fn end_trials(&mut self, scene: &Scene) -> Vec<LaneId> {
+        let params = &self.params.landmark;
+        let failed = |lane: &Landmark| {
+            self.frames - lane.born_at_frame == params.trial_frames && lane.observations < params.least_observations
+        };
+        let nearby = scene.runs.iter().map(|run| run.lane);
+        let dropped: Vec<LaneId> = nearby.filter(|id| self.lanes.get(id).is_some_and(failed)).collect();
         for id in &dropped {
             self.forget(*id);
         }

@@ -201,6 +201,8 @@ pub struct LandmarkParams {
     pub variance_inflation: f64,
     /// Lanes seen in fewer frames than this are not shown.
     pub least_observations: u32,
+    /// Frames after its birth at which a lane must have that many (`paper`).
+    pub trial_frames: u64,
     /// Noise of a detection, as it weighs in the map.
     pub noise: RangeNoise,
     /// A stretch of line is drawn where this share of its votes saw it.
@@ -272,6 +274,7 @@ impl Params {
                 window_frames: 0,
                 variance_inflation: 1.0,
                 least_observations: 4,
+                trial_frames: 6,
                 noise,
                 drawn_share: 0.0,
                 sure_range_m: 50.0,
@@ -353,6 +356,7 @@ impl Params {
                 window_frames: 3,
                 variance_inflation: 6.25,
                 least_observations: 3,
+                trial_frames: 6,
                 noise,
                 drawn_share: 0.5,
                 sure_range_m: 25.0,

@@ -14,6 +14,11 @@ const INDEPENDENCE: f64 = 0.5;
 /// Log-odds stay within `+-` this, so that what vanished can be given up.
 const CERTAIN: f64 = 6.0;
 
+/// Chance that a detector reports a line that runs well in view near the vehicle.
+pub const DETECTION: f64 = 0.85;
+/// A lane of less probability than this is given up.
+const GIVEN_UP: f64 = 0.05;
+
 /// Log-odds that a lane exists.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd, Serialize, Deserialize)]
 pub struct Existence {
@@ -44,6 +49,12 @@ impl Existence {
     /// Takes the evidence of another lane that turned out to be this one.
     pub fn absorb(&mut self, other: Self) {
         self.log_odds = (self.log_odds.max(0.0) + other.log_odds.max(0.0)).clamp(-CERTAIN, CERTAIN);
+    }
+
+    /// Whether so much speaks against the lane that the map forgets it.
+    #[must_use]
+    pub fn is_given_up(&self) -> bool {
+        self.probability() < GIVEN_UP
     }
 
     /// Probability that the lane exists.

@@ -45,6 +45,8 @@ pub struct Landmark {
     pub extent: Extent,
     /// Frames that saw it.
     pub observations: u32,
+    /// Number of the frame that began it, counted by its mapper.
+    pub born_at_frame: u64,
     /// Time of the first frame that saw it.
     pub first_seen: TimestampNs,
     /// Time of the last frame that saw it.
@@ -133,6 +135,7 @@ impl Landmark {
             existence: Existence::at_birth(),
             extent: Extent::default(),
             observations: 0,
+            born_at_frame: 0,
             first_seen: time,
             last_seen: time,
             rival: None,

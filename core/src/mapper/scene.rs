@@ -9,6 +9,7 @@ use crate::{
     geometry::{Pose, pose::perturb},
     landmark::{
         Landmark,
+        existence::DETECTION,
         foot_walk::FootWalk,
         index::{LaneIndex, NearbyRun, STALE_M},
         information::Knot,
@@ -173,5 +174,5 @@ pub(super) fn detection_probability(
     // Three control points well in view are enough to be reported; lines far to the side are often missed.
     let share = (length / 4.0).min(1.0);
     let side_m = if length > 0.0 { side / length } else { 0.0 };
-    share * (0.85 - 0.04 * (side_m - 2.0).clamp(0.0, 10.0))
+    share * (DETECTION - 0.04 * (side_m - 2.0).clamp(0.0, 10.0))
 }

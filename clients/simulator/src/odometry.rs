@@ -9,8 +9,8 @@ use lanemap_openlane::noisy_odometry;
 use crate::random::SimRng;
 
 /// What is left of the noise on the axes that the model does not disturb: metres, and radians.
-const RESIDUAL_M: f64 = 0.001;
-const RESIDUAL_RAD: f64 = 0.001 * std::f64::consts::PI / 180.0;
+const RESIDUAL_M: f64 = 0.0001;
+const RESIDUAL_RAD: f64 = 0.0001 * std::f64::consts::PI / 180.0;
 
 /// Noise of the motion between two frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -22,7 +22,7 @@ pub struct OdometryNoise {
 }
 
 impl OdometryNoise {
-    /// The covariance of one motion that a vehicle with this odometry would state; never less than 1 mm and 0.001 degrees.
+    /// The covariance of one motion that a vehicle with this odometry would state; never less than a tenth of a millimetre and 0.0001 degrees.
     #[must_use]
     pub fn motion_covariance(&self) -> TangentCovariance {
         let plane_m = self.translation_sigma_m.max(RESIDUAL_M);

@@ -11,9 +11,9 @@ use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
 use super::CommonArgs;
 
-/// What a vehicle states of a motion that has no error: 1 mm and 0.001 degrees.
-const RESIDUAL_M: f64 = 0.001;
-const RESIDUAL_DEG: f64 = 0.001;
+/// What a vehicle states of a motion that has no error: a tenth of a millimetre and 0.0001 degrees.
+const RESIDUAL_M: f64 = 0.0001;
+const RESIDUAL_DEG: f64 = 0.0001;
 
 /// Noise of the odometry between every two frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

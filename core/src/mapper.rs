@@ -34,7 +34,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 3;
+const SNAPSHOT_VERSION: u16 = 4;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -378,7 +378,7 @@ impl Mapper {
     /// Every lane of the drive that is worth showing, in the order of birth.
     #[must_use]
     pub fn lane_map(&self) -> LaneMap {
-        let shown = self.lanes.values().filter(|lane| local_map::is_shown(lane, &self.params));
+        let shown = self.lanes.values().filter(|lane| local_map::is_published(lane, &self.params));
         LaneMap { lanes: shown.filter_map(|lane| local_map::map_lane(lane, &self.params)).collect() }
     }
 

@@ -211,8 +211,10 @@ pub struct LandmarkParams {
     pub sure_range_m: f64,
     /// From this range on a detector may report nothing, metres.
     pub blind_range_m: f64,
-    /// Lanes are shown from this probability of existence on.
+    /// Lanes are shown in the local map from this probability of existence on.
     pub shown_existence: f64,
+    /// Lanes are published in the drive's map from this probability on: a map can wait for what a planner must know now.
+    pub published_existence: f64,
     /// A lane that this frame missed is shown in the local map if this much of it lies in the image, metres.
     pub shown_in_image_m: f64,
     /// A lane is shown in the local map if this much of it lies in the window, metres.
@@ -280,6 +282,7 @@ impl Params {
                 sure_range_m: 50.0,
                 blind_range_m: 51.0,
                 shown_existence: 0.0,
+                published_existence: 0.0,
                 shown_in_image_m: 0.0,
                 shown_in_window_m: 0.0,
             },
@@ -362,6 +365,7 @@ impl Params {
                 sure_range_m: 25.0,
                 blind_range_m: 41.0,
                 shown_existence: 0.6,
+                published_existence: 0.9,
                 shown_in_image_m: 8.0,
                 shown_in_window_m: 5.0,
             },

@@ -18,15 +18,18 @@ use crate::{
 /// Samples per chord of a local lane: 0.5 m apart for chords of 3 m.
 const PIECES_PER_CHORD: usize = 6;
 
-/// Whether a lane is believed enough to be shown.
-pub(super) fn is_shown(lane: &Landmark, params: &Params) -> bool {
-    match params.preset {
-        Preset::Paper => lane.observations >= params.landmark.least_observations,
-        Preset::Default => {
-            lane.observations >= params.landmark.least_observations
-                && lane.existence.probability() > params.landmark.shown_existence
-        }
-    }
+/// Whether a lane is believed enough to be shown to its vehicle.
+fn is_shown(lane: &Landmark, params: &Params) -> bool {
+    is_believed(lane, params.landmark.shown_existence, params)
+}
+
+/// Whether a lane is believed enough to be published in the drive's map.
+pub(super) fn is_published(lane: &Landmark, params: &Params) -> bool {
+    is_believed(lane, params.landmark.published_existence, params)
+}
+
+fn is_believed(lane: &Landmark, existence: f64, params: &Params) -> bool {
+    lane.observations >= params.landmark.least_observations && lane.existence.probability() > existence
 }
 
 /// A lane as it is published.

@@ -145,12 +145,6 @@ impl Frame {
     pub fn detections(&self) -> &[Detection] {
         &self.parts.detections
     }
-
-    /// Gives the parts back.
-    #[must_use]
-    pub fn into_parts(self) -> FrameParts {
-        self.parts
-    }
 }
 
 fn check_odometry(odometry: &Odometry, limits: &FrameLimits) -> Result<(), FrameError> {

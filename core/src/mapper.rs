@@ -329,9 +329,7 @@ impl Mapper {
 
     fn run_together(&self, old: &NearbyRun, young: &NearbyRun) -> bool {
         let (Some(a), Some(b)) = (self.lanes.get(&old.lane), self.lanes.get(&young.lane)) else { return false };
-        let params = &self.params.landmark;
-        let overlap = duplicate::overlap(b, (young.first, young.last), a, (old.first, old.last), params);
-        overlap.is_some_and(|(share, distance_m)| share > 0.7 && distance_m < 0.6)
+        duplicate::run_together(b, (young.first, young.last), a, (old.first, old.last), &self.params.landmark)
     }
 
     fn is_rival(&self, young: LaneId, old: LaneId) -> bool {

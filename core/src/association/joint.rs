@@ -72,7 +72,7 @@ pub fn associate_jointly(
         pose.across_m.max(params.least_sigma_m),
         pose.yaw_rad.max(params.least_sigma_rad),
     );
-    // How far the pose may push a line at mid range; below a third of a lane there is only one hypothesis.
+    // How far the pose may push a line at mid range; below a quarter of a lane there is only one hypothesis.
     let play_m = 2.0 * (sigma.y + params.play_range_m * sigma.z);
     let reach_m = params.gate_m + play_m;
     let mut scene = Scene {
@@ -153,7 +153,9 @@ fn summarise_pair(
     for point in points {
         let placed = moved(point, theta);
         index = lane.nearest_from(&placed, index);
-        let tangent = (lane.points[(index + 1).min(last)] - lane.points[index.saturating_sub(1)]).xy().normalize();
+        let along = (lane.points[(index + 1).min(last)] - lane.points[index.saturating_sub(1)]).xy();
+        // Points in one place have no direction, and a NaN would pass for a perfect fit.
+        let Some(tangent) = along.try_normalize(1e-9) else { continue };
         let offset = placed - lane.points[index];
         let beyond = offset.xy().dot(&tangent);
         if (index == 0 && beyond < -params.end_slack_m) || (index == last && beyond > params.end_slack_m) {
@@ -354,6 +356,14 @@ mod tests {
         detections[1].category = Category::WhiteSolid;
         let found = associate_jointly(&detections, &road(), &pose, &params);
         assert_eq!(found.lane_of, vec![Some(0), Some(1), Some(2), Some(3)]);
+    }
+
+    #[test]
+    fn a_lane_whose_points_lie_in_one_place_matches_nothing() {
+        let params = Params::preset(Preset::Default).association;
+        let pose = PoseUncertainty { yaw_rad: 0.001, along_m: 0.05, across_m: 0.05 };
+        let nowhere = LaneShape { points: vec![Point3::new(20.0, -5.0, 0.0); 8], ..road()[0].clone() };
+        assert_eq!(associate_jointly(&road()[..1], &[nowhere], &pose, &params).lane_of, vec![None]);
     }
 
     #[test]

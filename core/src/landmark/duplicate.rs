@@ -8,14 +8,30 @@
 use super::{Landmark, foot_walk::FootWalk, information::Knot};
 use crate::{lane_map::LaneId, params::LandmarkParams};
 
+/// Share of the younger lane that must lie along the older one.
+const LEAST_SHARE: f64 = 0.7;
+/// Greatest mean distance of the two, metres.
+const GREATEST_DISTANCE_M: f64 = 0.6;
 /// Frames that must speak for a duplicate, net of those against.
 const VERDICT: i32 = 3;
 /// Bound on the frames against, so that a real pair may later be seen to be one.
 const MOST_AGAINST: i32 = -6;
 
-/// Share of the control points near `young_near` that lie along `old`, and their mean distance, metres.
+/// Whether the part of a lane near `young_near` runs along `old`, so that the two may be one.
 #[must_use]
-pub fn overlap(
+pub fn run_together(
+    young: &Landmark,
+    young_near: (Knot, Knot),
+    old: &Landmark,
+    old_near: (Knot, Knot),
+    params: &LandmarkParams,
+) -> bool {
+    overlap(young, young_near, old, old_near, params)
+        .is_some_and(|(share, distance_m)| share > LEAST_SHARE && distance_m < GREATEST_DISTANCE_M)
+}
+
+/// Share of the control points near `young_near` that lie along `old`, and their mean distance, metres.
+fn overlap(
     young: &Landmark,
     young_near: (Knot, Knot),
     old: &Landmark,

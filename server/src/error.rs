@@ -21,6 +21,9 @@ pub enum Error {
         /// The name that was asked for.
         session: String,
     },
+    /// The peer may not do what it asked for. Who asked and for what is not repeated: it may be logged.
+    #[error("this peer may not stream as the vehicle that it names")]
+    NotPermitted,
     /// A newer stream of the same drive took over.
     #[error("a newer stream of this drive has taken over")]
     Superseded,
@@ -50,6 +53,7 @@ impl Error {
         match self {
             Self::Refused(_) => Code::InvalidArgument,
             Self::NoSuchSession { .. } => Code::NotFound,
+            Self::NotPermitted => Code::PermissionDenied,
             Self::Superseded => Code::Aborted,
             Self::ShuttingDown | Self::Journal(_) | Self::SessionGone => Code::Unavailable,
             Self::Unreadable { .. } => Code::DataLoss,

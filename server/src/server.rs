@@ -17,7 +17,7 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
     config::{ConfigError, ServerConfig},
-    ingest::IngestGrpc,
+    ingest::{IngestGrpc, conversation::Conversations},
     journal::{CommitterThread, Journal, JournalError},
     listener,
     map_service::MapGrpc,
@@ -100,8 +100,9 @@ impl Server {
         let (ready, is_ready) = watch::channel(true);
         let http = ServeState { sessions: sessions.clone(), metrics, ready: is_ready, shutdown: shutdown.clone() };
         let streams = TaskTracker::new();
-        let ingest = IngestGrpc::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
-        let (health, router) = router(&config, ingest, http).await?;
+        let conversations =
+            Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
+        let (health, router) = router(&config, IngestGrpc::new(conversations), http).await?;
 
         let running =
             Running { config, registry, streams, ready, health, shutdown: shutdown.clone(), journal_failed, committer };

@@ -251,7 +251,8 @@ impl Connection {
             }
             Some(Response::Pose(pose)) => self.tell(Event::Pose(Box::new(event::pose(&pose)?))),
             Some(Response::LocalMap(map)) => self.tell(Event::LocalMap(event::local_map(&map)?)),
-            Some(Response::Ended(_)) | None => {}
+            // gRPC says by its status how a stream ends.
+            Some(Response::Ended(_) | Response::Closed(_)) | None => {}
             Some(Response::Accepted(_)) => {
                 return Err(ClientError::Protocol("a session was accepted twice".to_owned()));
             }

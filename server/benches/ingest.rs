@@ -61,7 +61,7 @@ fn journal(criterion: &mut Criterion) {
     group.sample_size(20);
     let mut sequence = 0;
     for sessions in [1_u64, 100, 1000] {
-        let ids: Vec<_> = (1..=sessions).map(|unix_ms| SessionId::next(None, unix_ms)).collect();
+        let ids: Vec<_> = (1..=sessions).map(|unix_ms| SessionId::next(None, 0, unix_ms)).collect();
         group.throughput(Throughput::Elements(sessions));
         group.bench_function(format!("one_frame_each_of_{sessions}_sessions"), |bencher| {
             bencher.iter_batched(

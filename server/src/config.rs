@@ -51,6 +51,9 @@ pub struct ServerConfig {
     pub keep_alive_s: u64,
     /// Time that a shutdown gives open streams and connections to end, seconds.
     pub shutdown_grace_s: u64,
+    /// File of the key behind the pseudonyms of vehicles and drives, within the store's folder unless it is absolute.
+    /// Made at the first start where it is not there; without it no drive of the store can be resumed or deleted.
+    pub privacy_key_file: PathBuf,
 }
 
 impl Default for ServerConfig {
@@ -74,6 +77,7 @@ impl Default for ServerConfig {
             unload_after_s: 60,
             keep_alive_s: 20,
             shutdown_grace_s: 6,
+            privacy_key_file: PathBuf::from("privacy.key"),
         }
     }
 }
@@ -156,6 +160,10 @@ impl ServerConfig {
             max_point_range_m: self.max_point_range_m,
             max_odometry_range_m: self.max_odometry_range_m,
         }
+    }
+
+    pub(crate) fn privacy_key_path(&self) -> PathBuf {
+        self.data_dir.join(&self.privacy_key_file)
     }
 
     pub(crate) fn publish_interval(&self) -> Duration {

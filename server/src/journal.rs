@@ -5,6 +5,7 @@
 //! disk: a crash leaves either all of a batch or nothing of it, and only a batch that was synced is acked.
 
 mod committer;
+mod named_records;
 mod record;
 mod store;
 
@@ -15,7 +16,10 @@ use thiserror::Error;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
-use crate::session::SessionId;
+use crate::{
+    privacy::{Pseudonyms, pseudonym::KeyFingerprint},
+    session::SessionId,
+};
 pub use committer::CommitterThread;
 use committer::{Commit, Committer};
 pub use record::{SessionKey, SessionRecord, SessionSetup};
@@ -85,6 +89,25 @@ impl Journal {
         let failed = CancellationToken::new();
         let thread = Committer::new(store.clone(), waiting, max_frames_per_commit, failed.clone()).start()?;
         Ok((Self { store, commits, failed }, thread))
+    }
+
+    /// Which privacy key the store was written with; `None` in a store that is new, or older than pseudonyms.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn key_fingerprint(&self) -> Result<Option<KeyFingerprint>, JournalError> {
+        self.store.key_fingerprint()
+    }
+
+    /// Binds the store to the key of `pseudonyms`; a store whose records still hold names gets pseudonyms in their
+    /// place. Call it before anything else is written.
+    ///
+    /// # Errors
+    /// The store cannot be read or written, or an old record does not decode.
+    pub fn adopt_key(&self, pseudonyms: &Pseudonyms) -> Result<(), JournalError> {
+        let mut batch = self.store.batch();
+        batch.put_key_fingerprint(pseudonyms.fingerprint());
+        named_records::rename(&self.store, batch, pseudonyms)
     }
 
     /// Makes frames of one session durable; they are on the disk when this returns.
@@ -183,11 +206,21 @@ mod tests {
         frames.map(|f| JournalFrame { sequence: f.sequence(), bytes: frame_bytes(&f).unwrap() }).collect()
     }
 
+    /// The same ones at every call.
+    fn pseudonyms() -> Pseudonyms {
+        static PSEUDONYMS: std::sync::LazyLock<Pseudonyms> = std::sync::LazyLock::new(|| {
+            let folder = tempfile::tempdir().unwrap();
+            Pseudonyms::open(&folder.path().join("privacy.key"), None).unwrap()
+        });
+        PSEUDONYMS.clone()
+    }
+
     fn record(id: SessionId) -> SessionRecord {
         let key = SessionKey { fleet: "f".into(), vehicle: "v".into(), drive: id.to_string() };
         SessionRecord {
             id,
-            key,
+            drive: pseudonyms().drive(&key),
+            vehicle: pseudonyms().vehicle(&key.fleet, &key.vehicle),
             setup: SessionSetup { preset: Preset::Paper, sensor: Sensor::default() },
             ended: false,
         }
@@ -200,7 +233,7 @@ mod tests {
     #[tokio::test]
     async fn what_was_appended_is_there_when_the_folder_is_opened_again() {
         let folder = tempfile::tempdir().unwrap();
-        let (first, second) = (SessionId::next(None, 1), SessionId::next(None, 2));
+        let (first, second) = (SessionId::next(None, 0, 1), SessionId::next(None, 0, 2));
         let (journal, thread) = Journal::open(folder.path(), 100).unwrap();
         journal.put_record(record(first)).await.unwrap();
         journal.append(first, journaled([1, 2, 256])).await.unwrap();
@@ -217,7 +250,7 @@ mod tests {
     #[tokio::test]
     async fn a_snapshot_replaces_the_frames_that_it_covers_and_no_other() {
         let folder = tempfile::tempdir().unwrap();
-        let (first, second) = (SessionId::next(None, 1), SessionId::next(None, 2));
+        let (first, second) = (SessionId::next(None, 0, 1), SessionId::next(None, 0, 2));
         let (journal, _thread) = Journal::open(folder.path(), 2).unwrap();
         journal.append(first, journaled(1..=5)).await.unwrap();
         journal.append(second, journaled(1..=5)).await.unwrap();

@@ -13,6 +13,7 @@ pub mod ingest;
 pub mod journal;
 mod listener;
 pub mod map_service;
+pub mod privacy;
 pub mod serve;
 pub mod server;
 pub mod session;

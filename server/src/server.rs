@@ -21,6 +21,7 @@ use crate::{
     journal::{CommitterThread, Journal, JournalError},
     listener,
     map_service::MapGrpc,
+    privacy::{KeyError, Pseudonyms},
     serve::{self, ServeState},
     session::{Sessions, actor::Surroundings, registry::SessionRegistry},
     telemetry,
@@ -46,6 +47,9 @@ pub enum StartError {
         /// What is wrong with it.
         source: JournalError,
     },
+    /// The pseudonyms' key cannot be used.
+    #[error(transparent)]
+    PrivacyKey(#[from] KeyError),
     /// The address cannot be listened on.
     #[error("listening on {address}: {source}")]
     Listen {
@@ -83,11 +87,13 @@ impl Server {
         let config = Arc::new(config);
         let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
         let (journal, committer) = Journal::open(&config.data_dir, config.max_frames_per_commit).map_err(in_store)?;
+        let pseudonyms = pseudonyms(&config, &journal)?;
         let (sessions, shutdown) = (Sessions::default(), CancellationToken::new());
         let journal_failed = journal.failed();
         let surroundings = Surroundings {
             config: Arc::clone(&config),
             journal,
+            pseudonyms,
             sessions: sessions.clone(),
             shutdown: shutdown.clone(),
         };
@@ -225,6 +231,17 @@ impl Running {
             tracing::warn!("the journal was still in use at the end of the grace time");
         }
     }
+}
+
+/// The pseudonyms of the store's drives.
+fn pseudonyms(config: &ServerConfig, journal: &Journal) -> Result<Pseudonyms, StartError> {
+    let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
+    let written_with = journal.key_fingerprint().map_err(in_store)?;
+    let pseudonyms = Pseudonyms::open(&config.privacy_key_path(), written_with)?;
+    if written_with.is_none() {
+        journal.adopt_key(&pseudonyms).map_err(in_store)?;
+    }
+    Ok(pseudonyms)
 }
 
 /// gRPC beside HTTP on one router. Unknown paths are the HTTP side's to answer.

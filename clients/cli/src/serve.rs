@@ -73,6 +73,10 @@ pub struct ServeArgs {
     /// [env: LANEMAP_SHUTDOWN_GRACE_S] [default: 6]
     #[arg(long, value_name = "S")]
     shutdown_grace_s: Option<u64>,
+    /// File of the key behind the pseudonyms of vehicles and drives, within the store's folder unless it is absolute;
+    /// made at the first start [env: LANEMAP_PRIVACY_KEY_FILE] [default: privacy.key]
+    #[arg(long, value_name = "FILE")]
+    privacy_key_file: Option<PathBuf>,
 }
 
 impl ServeArgs {
@@ -95,6 +99,7 @@ impl ServeArgs {
             unload_after_s: self.unload_after_s,
             keep_alive_s: self.keep_alive_s,
             shutdown_grace_s: self.shutdown_grace_s,
+            privacy_key_file: self.privacy_key_file.clone(),
         }
     }
 }

@@ -41,6 +41,8 @@ pub struct ConfigOverrides {
     pub keep_alive_s: Option<u64>,
     /// See [`ServerConfig::shutdown_grace_s`].
     pub shutdown_grace_s: Option<u64>,
+    /// See [`ServerConfig::privacy_key_file`].
+    pub privacy_key_file: Option<PathBuf>,
 }
 
 impl ConfigOverrides {
@@ -62,6 +64,7 @@ impl ConfigOverrides {
         set(&mut settings.unload_after_s, self.unload_after_s);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
         set(&mut settings.shutdown_grace_s, self.shutdown_grace_s);
+        set(&mut settings.privacy_key_file, self.privacy_key_file);
     }
 }
 

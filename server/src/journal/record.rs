@@ -1,12 +1,18 @@
 //! What the store keeps of a session besides its frames.
 
+use std::fmt;
+
 use lanemap_core::{Preset, Sensor};
 use serde::{Deserialize, Serialize};
 
-use crate::session::SessionId;
+use crate::{
+    privacy::{DrivePseudonym, VehiclePseudonym},
+    session::SessionId,
+};
 
-/// The key under which a vehicle opens and resumes a drive. Never shown to map consumers.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+/// The names under which a vehicle opens and resumes a drive. They go no further than the stream that brought them: the
+/// store, the logs and the readers of maps know pseudonyms. `{:?}` does not show them.
+#[derive(Clone, PartialEq, Eq)]
 pub struct SessionKey {
     /// The fleet.
     pub fleet: String,
@@ -14,6 +20,12 @@ pub struct SessionKey {
     pub vehicle: String,
     /// The drive of the vehicle, chosen by the client.
     pub drive: String,
+}
+
+impl fmt::Debug for SessionKey {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("SessionKey(..)")
+    }
 }
 
 /// How a drive is mapped; does not change within it.
@@ -30,8 +42,10 @@ pub struct SessionSetup {
 pub struct SessionRecord {
     /// The server's name of the session.
     pub id: SessionId,
-    /// The vehicle's name of it.
-    pub key: SessionKey,
+    /// The drive, by which it is found again.
+    pub drive: DrivePseudonym,
+    /// The vehicle, by which all of its drives are found when they are to be deleted.
+    pub vehicle: VehiclePseudonym,
     /// How it is mapped.
     pub setup: SessionSetup,
     /// Whether the drive is over.

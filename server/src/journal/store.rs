@@ -1,10 +1,13 @@
 //! Layout of the embedded store.
 //!
-//! | keyspace    | key                                          | value                   |
-//! |-------------|----------------------------------------------|-------------------------|
-//! | `sessions`  | id, 8 bytes big-endian                       | record, postcard        |
-//! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard         |
-//! | `snapshots` | id                                           | the session's own bytes |
+//! | keyspace    | key                                          | value                       |
+//! |-------------|----------------------------------------------|-----------------------------|
+//! | `records`   | id, 8 bytes big-endian                       | record, postcard            |
+//! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard             |
+//! | `snapshots` | id                                           | the session's own bytes     |
+//! | `store`     | `privacy key`                                | the key's fingerprint       |
+//!
+//! No name of a fleet, a vehicle or a drive stands in any of them.
 
 use std::path::Path;
 
@@ -12,15 +15,19 @@ use fjall::{Database, Keyspace, KeyspaceCreateOptions, OwnedWriteBatch, PersistM
 use lanemap_core::{Frame, Sequence};
 
 use super::{JournalError, JournalFrame, SessionRecord, decode_error};
-use crate::session::SessionId;
+use crate::{privacy::pseudonym::KeyFingerprint, session::SessionId};
+
+/// Key of the privacy key's fingerprint in the keyspace `store`.
+const KEY_FINGERPRINT: &str = "privacy key";
 
 /// The keyspaces of one folder.
 #[derive(Clone)]
 pub(super) struct Store {
-    database: Database,
-    sessions: Keyspace,
+    pub(super) database: Database,
+    records: Keyspace,
     frames: Keyspace,
     snapshots: Keyspace,
+    store: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
@@ -39,8 +46,9 @@ impl Store {
     pub(super) fn open(folder: &Path) -> Result<Self, JournalError> {
         let database = Database::builder(folder).open()?;
         let keyspace = |name| database.keyspace(name, KeyspaceCreateOptions::default);
-        let (sessions, frames, snapshots) = (keyspace("sessions")?, keyspace("frames")?, keyspace("snapshots")?);
-        Ok(Self { database, sessions, frames, snapshots })
+        let (records, frames, snapshots) = (keyspace("records")?, keyspace("frames")?, keyspace("snapshots")?);
+        let store = keyspace("store")?;
+        Ok(Self { database, records, frames, snapshots, store })
     }
 
     pub(super) fn batch(&self) -> StoreBatch<'_> {
@@ -48,11 +56,20 @@ impl Store {
     }
 
     pub(super) fn records(&self) -> Result<Vec<SessionRecord>, JournalError> {
-        self.sessions.iter().map(|entry| record(&entry.value()?)).collect()
+        self.records.iter().map(|entry| record(&entry.value()?)).collect()
     }
 
     pub(super) fn record(&self, session: SessionId) -> Result<Option<SessionRecord>, JournalError> {
-        self.sessions.get(session.to_key())?.map(|value| record(&value)).transpose()
+        self.records.get(session.to_key())?.map(|value| record(&value)).transpose()
+    }
+
+    pub(super) fn key_fingerprint(&self) -> Result<Option<KeyFingerprint>, JournalError> {
+        let Some(bytes) = self.store.get(KEY_FINGERPRINT)? else { return Ok(None) };
+        let bytes = (*bytes).try_into().map_err(|_| JournalError::Decode {
+            what: "the fingerprint of the privacy key".to_owned(),
+            reason: format!("it has {} bytes", bytes.len()),
+        })?;
+        Ok(Some(KeyFingerprint(bytes)))
     }
 
     pub(super) fn snapshot(&self, session: SessionId) -> Result<Option<Vec<u8>>, JournalError> {
@@ -73,9 +90,13 @@ impl StoreBatch<'_> {
         self.batch.insert(&self.store.frames, frame_key(session, frame.sequence), frame.bytes);
     }
 
+    pub(super) fn put_key_fingerprint(&mut self, fingerprint: KeyFingerprint) {
+        self.batch.insert(&self.store.store, KEY_FINGERPRINT, fingerprint.0);
+    }
+
     pub(super) fn put_record(&mut self, record: &SessionRecord) -> Result<(), JournalError> {
         let bytes = postcard::to_stdvec(record).map_err(|error| decode_error("a session's record", &error))?;
-        self.batch.insert(&self.store.sessions, record.id.to_key(), bytes);
+        self.batch.insert(&self.store.records, record.id.to_key(), bytes);
         Ok(())
     }
 

@@ -172,8 +172,8 @@ mod tests {
     fn three_sessions() -> Vec<Arc<PublishedMap>> {
         [(1, Some(11.58)), (2, None), (3, Some(11.60))]
             .into_iter()
-            .map(|(unix_ms, longitude)| {
-                let mut map = published(unix_ms, 3);
+            .map(|(number, longitude)| {
+                let mut map = published(number, 3);
                 map.georeference = longitude.map(|longitude| georeference(longitude, 48.14));
                 Arc::new(map)
             })

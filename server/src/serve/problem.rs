@@ -165,7 +165,7 @@ mod tests {
 
     #[test]
     fn a_session_off_the_earth_is_refused_with_the_address_of_its_metres() {
-        let session = SessionId::next(None, 1);
+        let session = SessionId::next(None, 0, 1);
         let document = serde_json::to_value(Problem::NotGeoreferenced { session }.document()).unwrap();
         assert_eq!(document["status"], 409);
         assert_eq!(document["type"], "urn:lanemap:problem:not-georeferenced");

@@ -44,8 +44,8 @@ pub fn lane_of(id: u64, points: Vec<Point3<f64>>) -> MapLane {
     }
 }
 
-/// The session created at a millisecond, with `lanes` lanes side by side and no place on the earth.
-pub fn published(unix_ms: u64, lanes: u64) -> PublishedMap {
+/// The session numbered so, with `lanes` lanes side by side and no place on the earth.
+pub fn published(number: u64, lanes: u64) -> PublishedMap {
     let lanes = (1..=lanes)
         .map(|id| {
             let points = bend(200.0, 20).into_iter().map(|p| p + nalgebra::Vector3::new(0.0, 3.5 * id as f64, 0.0));
@@ -53,7 +53,7 @@ pub fn published(unix_ms: u64, lanes: u64) -> PublishedMap {
         })
         .collect();
     PublishedMap {
-        session: SessionId::next(None, unix_ms),
+        session: SessionId::next(None, 0, number),
         version: MapVersion(12),
         state: SessionState::Live,
         preset: Preset::Default,

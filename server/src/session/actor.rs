@@ -27,6 +27,7 @@ use crate::{
     error::Error,
     ingest::{Outbox, Refusal},
     journal::{Journal, JournalError, JournalFrame, frame_bytes},
+    privacy::Pseudonyms,
     telemetry,
 };
 
@@ -75,6 +76,7 @@ pub(crate) struct Attached {
 pub(crate) struct Surroundings {
     pub(crate) config: Arc<ServerConfig>,
     pub(crate) journal: Journal,
+    pub(crate) pseudonyms: Pseudonyms,
     pub(crate) sessions: Sessions,
     pub(crate) shutdown: CancellationToken,
 }

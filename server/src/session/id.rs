@@ -5,7 +5,9 @@ use std::{fmt, str::FromStr};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Name of a session: grows with the time of creation, and is never given twice, not even by a store that was wiped.
+/// Name of a session: grows with the time of creation, and is hardly ever given twice, not even by a store that was wiped.
+///
+/// It tells the hour in which a drive began, as the map's own times do, and not the moment, which the map may hide.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct SessionId(u64);
 
@@ -17,15 +19,24 @@ pub struct SessionIdError {
     pub text: String,
 }
 
-/// Bits below the milliseconds: ids of sessions that begin in one millisecond.
-const BITS_WITHIN_MILLISECOND: u32 = 16;
+/// Milliseconds of an hour.
+const HOUR_MS: u64 = 3_600_000;
+/// Ids of one hour: 2^38, room for 10 million drives; the bits above hold the hours of 7,000 years.
+const BITS_WITHIN_HOUR: u32 = 38;
+/// The first id of an hour is one of so many, so that a store that was wiped does not give it again.
+const FIRST_OF_HOUR: u64 = 1 << 36;
+/// Every other lies up to so many above the one before.
+const MOST_STEP: u64 = 1 << 14;
 
 impl SessionId {
-    /// The id of a session created at `unix_ms`, after `previous`.
+    /// The id of a session created in the hour of `unix_ms`, after `previous`; `noise` chooses among those that follow.
     #[must_use]
-    pub fn next(previous: Option<Self>, unix_ms: u64) -> Self {
-        let by_time = unix_ms << BITS_WITHIN_MILLISECOND;
-        Self(previous.map_or(by_time, |previous| by_time.max(previous.0 + 1)))
+    pub fn next(previous: Option<Self>, unix_ms: u64, noise: u64) -> Self {
+        let hour = (unix_ms / HOUR_MS) << BITS_WITHIN_HOUR;
+        Self(match previous {
+            Some(previous) if previous.0 >= hour => previous.0 + 1 + noise % MOST_STEP,
+            _ => hour + noise % FIRST_OF_HOUR,
+        })
     }
 
     /// Big-endian bytes: keys of the store that sort as the ids do.
@@ -66,16 +77,24 @@ mod tests {
 
     #[test]
     fn an_id_survives_its_text_and_its_key() {
-        let id = SessionId::next(None, 1_700_000_000_000);
+        let id = SessionId::next(None, 1_700_000_000_000, 77);
         assert_eq!(id.to_string().parse(), Ok(id));
         assert_eq!(SessionId::from_key(id.to_key()), id);
     }
 
     #[test]
     fn ids_grow_even_when_the_clock_falls_back() {
-        let first = SessionId::next(None, 1_000);
-        let second = SessionId::next(Some(first), 900);
+        let first = SessionId::next(None, HOUR_MS, 5);
+        let second = SessionId::next(Some(first), 0, 0);
         assert!(second > first);
+    }
+
+    #[test]
+    fn an_id_does_not_tell_when_within_the_hour_its_drive_began() {
+        let (early, late) =
+            (1_700_000_000_000 / HOUR_MS * HOUR_MS, 1_700_000_000_000 / HOUR_MS * HOUR_MS + HOUR_MS - 1);
+        assert_eq!(SessionId::next(None, early, 9), SessionId::next(None, late, 9));
+        assert_ne!(SessionId::next(None, early, 9), SessionId::next(None, early, 10));
     }
 
     #[test]

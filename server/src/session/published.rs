@@ -136,7 +136,7 @@ mod tests {
     #[test]
     fn a_reader_keeps_its_version_while_a_newer_one_is_published() {
         let sessions = Sessions::default();
-        let id = SessionId::next(None, 1);
+        let id = SessionId::next(None, 0, 1);
         sessions.publish(map(id, 1));
         let held = sessions.get(&id).unwrap();
         sessions.publish(map(id, 2));
@@ -147,8 +147,8 @@ mod tests {
     #[test]
     fn sessions_are_listed_in_the_order_of_their_ids() {
         let sessions = Sessions::default();
-        let first = SessionId::next(None, 1);
-        let second = SessionId::next(Some(first), 1);
+        let first = SessionId::next(None, 0, 1);
+        let second = SessionId::next(Some(first), 0, 1);
         sessions.publish(map(second, 1));
         sessions.publish(map(first, 1));
         let listed: Vec<_> = sessions.list().iter().map(|map| map.session).collect();

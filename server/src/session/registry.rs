@@ -30,6 +30,7 @@ use crate::{
     error::Error,
     ingest::{Outbox, Refusal, decode::Start},
     journal::{Journal, JournalError},
+    privacy::{DrivePseudonym, Pseudonyms},
     telemetry,
 };
 
@@ -68,7 +69,7 @@ pub(crate) struct SessionRegistry {
 
 struct Shared {
     surroundings: Surroundings,
-    slots: Mutex<HashMap<SessionKey, Arc<AsyncMutex<Slot>>>>,
+    slots: Mutex<HashMap<DrivePseudonym, Arc<AsyncMutex<Slot>>>>,
     last_id: Mutex<Option<SessionId>>,
     live: Arc<Semaphore>,
     streams: AtomicU64,
@@ -111,7 +112,7 @@ impl SessionRegistry {
         stream::iter(&records).for_each_concurrent(cores(), |record| recover_one(&surroundings, record)).await;
         for record in records {
             let slot = Slot { record: Some(record.clone()), actor: None };
-            slots.insert(record.key, Arc::new(AsyncMutex::new(slot)));
+            slots.insert(record.drive, Arc::new(AsyncMutex::new(slot)));
         }
         metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
         let shared = Shared {
@@ -128,7 +129,7 @@ impl SessionRegistry {
     /// Opens a stream of a drive: begins the drive or resumes it, and supersedes a stream that is still open.
     pub(crate) async fn open(&self, start: &Start, outbox: &Outbox) -> Result<Attachment, OpenError> {
         let live = self.live_permit().map_err(OpenError::Refused)?;
-        let slot = self.slot(&start.key).map_err(OpenError::Refused)?;
+        let slot = self.slot(self.pseudonyms().drive(&start.key)).map_err(OpenError::Refused)?;
         let mut slot = slot.lock().await;
         let record = self.record(&mut slot, start).await?;
         if let Some(actor) = &slot.actor {
@@ -158,17 +159,21 @@ impl SessionRegistry {
         permit.map(LivePermit::new).map_err(|_| capacity("streams", maximum))
     }
 
-    fn slot(&self, key: &SessionKey) -> Result<Arc<AsyncMutex<Slot>>, Refusal> {
+    fn pseudonyms(&self) -> &Pseudonyms {
+        &self.shared.surroundings.pseudonyms
+    }
+
+    fn slot(&self, drive: DrivePseudonym) -> Result<Arc<AsyncMutex<Slot>>, Refusal> {
         let maximum = self.shared.surroundings.config.max_sessions;
         let mut slots = locked(&self.shared.slots);
-        if let Some(slot) = slots.get(key) {
+        if let Some(slot) = slots.get(&drive) {
             return Ok(Arc::clone(slot));
         }
         if slots.len() >= maximum {
             return Err(capacity("drives", maximum));
         }
         let slot = Arc::<AsyncMutex<Slot>>::default();
-        slots.insert(key.clone(), Arc::clone(&slot));
+        slots.insert(drive, Arc::clone(&slot));
         metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
         Ok(slot)
     }
@@ -181,19 +186,25 @@ impl SessionRegistry {
             }
             return Ok(record.clone());
         }
-        let (key, setup) = (start.key.clone(), start.setup.clone());
-        let record = SessionRecord { id: self.next_id(), key, setup, ended: false };
+        let record = self.new_record(start);
         let journal = &self.shared.surroundings.journal;
         journal.put_record(record.clone()).await.map_err(Error::from)?;
         slot.record = Some(record.clone());
         Ok(record)
     }
 
-    fn next_id(&self) -> SessionId {
+    fn new_record(&self, start: &Start) -> SessionRecord {
+        let SessionKey { fleet, vehicle, .. } = &start.key;
+        let (drive, vehicle) = (self.pseudonyms().drive(&start.key), self.pseudonyms().vehicle(fleet, vehicle));
+        SessionRecord { id: self.next_id(drive), drive, vehicle, setup: start.setup.clone(), ended: false }
+    }
+
+    fn next_id(&self, drive: DrivePseudonym) -> SessionId {
         let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let unix_ms = u64::try_from(since_epoch.as_millis()).unwrap_or(0);
+        let noise = self.pseudonyms().noise(drive, since_epoch.as_nanos());
         let mut last = locked(&self.shared.last_id);
-        let id = SessionId::next(*last, unix_ms);
+        let id = SessionId::next(*last, unix_ms, noise);
         *last = Some(id);
         id
     }

@@ -1,0 +1,12 @@
+//! What the service may know and show of who drove where.
+//!
+//! * Vehicle ids, fleet ids and the clients' names of drives become keyed digests ([`pseudonym`]) where a stream opens.
+//!   The store holds digests only; whoever has it but not the [`key`] cannot tell which vehicle it was, nor try names out.
+//! * Readers of maps see a session id, which is new for every drive and made of no vehicle's name: it tells nothing of
+//!   two drives of one vehicle.
+
+pub mod key;
+pub mod pseudonym;
+
+pub use key::{KeyError, PrivacyKey};
+pub use pseudonym::{DrivePseudonym, Pseudonyms, VehiclePseudonym};

@@ -6,6 +6,7 @@
 
 pub mod drives;
 pub mod folders;
+pub mod http;
 pub mod raw_stream;
 pub mod servers;
 pub mod simulated;

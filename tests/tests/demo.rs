@@ -9,6 +9,7 @@ use std::{
     time::Duration,
 };
 
+use lanemap_tests::http;
 use serde_json::Value;
 use tokio::time::{interval, timeout};
 
@@ -61,7 +62,7 @@ impl Drop for Running {
 }
 
 async fn sessions(base: &str) -> Vec<Value> {
-    let answer: Value = reqwest::get(format!("{base}/sessions")).await.unwrap().json().await.unwrap();
+    let answer: Value = http::get(format!("{base}/sessions")).await.unwrap().json().await.unwrap();
     answer["sessions"].as_array().unwrap().clone()
 }
 
@@ -91,7 +92,7 @@ async fn the_demo_answers_at_its_address_its_maps_grow_on_the_earth_and_ctrl_c_e
     let mut demo = Running::start("demo", store.path(), &["--vehicles", "3"]);
     let viewer = demo.address();
     let base = viewer.strip_suffix("/viewer").unwrap().to_owned();
-    let page = reqwest::get(&viewer).await.unwrap().error_for_status().unwrap().text().await.unwrap();
+    let page = http::get(&viewer).await.unwrap().error_for_status().unwrap().text().await.unwrap();
     assert!(page.contains("<html"), "{page}");
 
     let early = sessions_until(&base, |all| all.len() == 3 && frames_of(all).iter().all(|frames| *frames >= 1)).await;
@@ -100,7 +101,7 @@ async fn the_demo_answers_at_its_address_its_maps_grow_on_the_earth_and_ctrl_c_e
     let has_lanes = |all: &[Value]| all.iter().any(|session| session["lanes"].as_u64() > Some(0));
     sessions_until(&base, has_lanes).await;
 
-    let lanes: Value = reqwest::get(format!("{base}/collections/lanes/items")).await.unwrap().json().await.unwrap();
+    let lanes: Value = http::get(format!("{base}/collections/lanes/items")).await.unwrap().json().await.unwrap();
     let place = &lanes["features"][0]["geometry"]["coordinates"][0];
     assert!((place[0].as_f64().unwrap() - 7.68).abs() < 0.05, "in Turin: {place}");
     assert!((place[1].as_f64().unwrap() - 45.07).abs() < 0.05, "in Turin: {place}");
@@ -123,7 +124,7 @@ async fn serve_says_where_it_listens_and_ctrl_c_ends_it() {
     let store = tempfile::tempdir().unwrap();
     let mut server = Running::start("serve", store.path(), &[]);
     let base = server.address();
-    let ready = reqwest::get(format!("{base}/readyz")).await.unwrap();
+    let ready = http::get(format!("{base}/readyz")).await.unwrap();
     assert!(ready.status().is_success());
     assert!(server.interrupt().await.success());
 }

@@ -41,7 +41,7 @@ impl Service {
             ..ServerConfig::default()
         };
         let server = Server::start(config).await.unwrap();
-        Self { server, client: reqwest::Client::new(), _data: data }
+        Self { server, client: lanemap_tests::http::client(), _data: data }
     }
 
     /// Uploads a whole drive over gRPC and waits until its map is published as closed; gives the session's id.

@@ -15,6 +15,7 @@ use lanemap_proto::{
 use lanemap_server::{Server, ServerConfig, session::SessionState};
 use lanemap_tests::{
     drives::{self, Drive, assert_same_map},
+    http,
     raw_stream::RawStream,
     servers::{self, map_bytes},
 };
@@ -51,7 +52,7 @@ async fn http_serves_the_same_bytes_as_grpc() {
     let drive = drives::simulated(5, 60);
     let id = stream(&server.url(), &drive, drive.start()).await;
     let url = format!("{}/sessions/{id}/lanes.pb", server.url());
-    let bytes = reqwest::get(url).await.unwrap().error_for_status().unwrap().bytes().await.unwrap();
+    let bytes = http::get(url).await.unwrap().error_for_status().unwrap().bytes().await.unwrap();
     assert_same_map(&bytes, &drive);
     let lanes = lanemap_client::MapClient::new(server.url()).lane_map(&id).await.unwrap();
     assert_eq!(lanes, drive.mapped().lane_map());
@@ -288,7 +289,7 @@ async fn health_and_reflection_answer_on_the_same_port() {
     let names: Vec<_> = services.service.iter().map(|service| service.name.as_str()).collect();
     assert!(names.contains(&"lanemap.v1.IngestService") && names.contains(&"lanemap.v1.MapService"), "{names:?}");
 
-    let missing = reqwest::get(format!("{}/nothing/here", server.url())).await.unwrap();
+    let missing = http::get(format!("{}/nothing/here", server.url())).await.unwrap();
     assert_eq!(missing.status(), 404);
 }
 

@@ -13,7 +13,7 @@ use lanemap_client::MapClient;
 use lanemap_core::{Frame, FrameLimits, LaneMap, Mapper, Params, Preset, Sequence};
 use lanemap_openlane::Drives;
 use lanemap_simulator::{OdometryNoise, Scenario, openlane::write_simulation};
-use lanemap_tests::{folders::files, servers};
+use lanemap_tests::{folders::files, http, servers};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -203,7 +203,7 @@ async fn an_origin_puts_the_map_on_the_earth() {
     let output = replay(drives.path(), &["--server", &server.url(), "--origin", "-33.8688,151.2093"]);
     assert_success(&output);
     let url = report(&output)["drives"][0]["session"]["lanes_url"].as_str().unwrap().to_owned();
-    let lanes: Value = reqwest::get(url).await.unwrap().error_for_status().unwrap().json().await.unwrap();
+    let lanes: Value = http::get(url).await.unwrap().error_for_status().unwrap().json().await.unwrap();
     let place = &lanes["features"][0]["geometry"]["coordinates"][0];
     assert!((place[0].as_f64().unwrap() - 151.2093).abs() < 0.02, "{place}");
     assert!((place[1].as_f64().unwrap() + 33.8688).abs() < 0.02, "{place}");

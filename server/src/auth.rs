@@ -1,55 +1,30 @@
 //! Who a peer is, and what it may do.
+//!
+//! | who | shows it by | may |
+//! |---|---|---|
+//! | a vehicle | its certificate, its key or user name over zenoh | stream as itself, read |
+//! | a program | a bearer token (JWT) with claims `fleet`, `vehicle` and `scope` | what its claims say |
+//! | an operator | a token of scope `admin` | read, administer |
+//! | nobody | | read maps where `anonymous_read` is set; ask for health always |
+//!
+//! A [`certificate_name`] and a [`tokens`] become a [`Peer`]; what a peer does is asked of it where it does it: streams
+//! where their session starts, readers and administrators at each request. Where nothing is set by which peers could
+//! show who they are, all are trusted, and [`exposure`] keeps the service on the loopback interface.
+//!
+//! Nothing here logs an id of a vehicle, a token, a key or a password.
 
-use crate::error::Error;
+pub mod authenticator;
+pub mod certificate_name;
+pub mod exposure;
+pub mod keys;
+pub mod layer;
+pub mod peer;
+pub mod reload;
+pub mod tls;
+pub mod tokens;
+pub mod vehicle_name;
 
-/// Who sends: asked once per stream, where its session starts.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Peer {
-    /// The only vehicle that it may stream as; `None`: any.
-    vehicle: Option<Vehicle>,
-}
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Vehicle {
-    fleet: String,
-    vehicle: String,
-}
-
-impl Peer {
-    /// A peer that nobody asked who it is: it may stream as any vehicle.
-    #[must_use]
-    pub fn unauthenticated() -> Self {
-        Self { vehicle: None }
-    }
-
-    /// A peer that speaks for one vehicle, e.g. because the key on which it publishes names it.
-    #[must_use]
-    pub fn of_vehicle(fleet: impl Into<String>, vehicle: impl Into<String>) -> Self {
-        Self { vehicle: Some(Vehicle { fleet: fleet.into(), vehicle: vehicle.into() }) }
-    }
-
-    /// Whether the peer may stream as this vehicle.
-    ///
-    /// # Errors
-    /// [`Error::NotPermitted`] where it may not.
-    pub fn may_stream(&self, fleet: &str, vehicle: &str) -> Result<(), Error> {
-        match &self.vehicle {
-            Some(only) if only.fleet != fleet || only.vehicle != vehicle => Err(Error::NotPermitted),
-            _ => Ok(()),
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_peer_of_one_vehicle_streams_as_no_other() {
-        let peer = Peer::of_vehicle("north", "car-1");
-        assert!(peer.may_stream("north", "car-1").is_ok());
-        assert!(matches!(peer.may_stream("north", "car-2"), Err(Error::NotPermitted)));
-        assert!(matches!(peer.may_stream("south", "car-1"), Err(Error::NotPermitted)));
-        assert!(Peer::unauthenticated().may_stream("south", "car-1").is_ok());
-    }
-}
+pub use authenticator::{AuthenticationError, Authenticator};
+pub use layer::peer_of;
+pub use peer::{Action, Peer, Role};
+pub use vehicle_name::VehicleName;

@@ -9,6 +9,8 @@ use lanemap_core::FrameLimits;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::auth::exposure;
+
 mod overrides;
 
 pub use overrides::ConfigOverrides;
@@ -19,6 +21,31 @@ pub use overrides::ConfigOverrides;
 pub struct ServerConfig {
     /// Address and port for gRPC and HTTP, e.g. `0.0.0.0:8080`; port 0 takes any free one.
     pub listen: SocketAddr,
+    /// Listen beyond the loopback interface although there is no TLS, or peers do not show who they are: in a private
+    /// network, or behind a proxy that does both.
+    pub insecure_listen_anywhere: bool,
+    /// Certificates that the service shows, PEM, its own first; with `tls_key_file`: TLS on the port, and no plain text.
+    pub tls_cert_file: Option<PathBuf>,
+    /// Private key of the first certificate of `tls_cert_file`, PEM.
+    pub tls_key_file: Option<PathBuf>,
+    /// Authorities whose client certificates are taken, PEM: a certificate names its vehicle.
+    pub tls_client_ca_file: Option<PathBuf>,
+    /// Lists of revoked client certificates, PEM.
+    pub tls_client_crl_file: Option<PathBuf>,
+    /// Refuse connections without a client certificate; without this, a bearer token will do.
+    pub tls_require_client_certificate: bool,
+    /// Time for a TLS handshake, seconds, at least 1.
+    pub tls_handshake_timeout_s: u64,
+    /// Most TLS handshakes at a time, at least 1; more wait.
+    pub max_tls_handshakes: usize,
+    /// Keys that verify bearer tokens: a JWKS, or public keys in PEM.
+    pub token_keys_file: Option<PathBuf>,
+    /// Issuer of bearer tokens, their claim `iss`.
+    pub token_issuer: Option<String>,
+    /// Audience of bearer tokens, one of their claim `aud`.
+    pub token_audience: String,
+    /// Let anybody read maps and metrics, where others show who they are.
+    pub anonymous_read: bool,
     /// Folder of the embedded store; created where it does not exist.
     pub data_dir: PathBuf,
     /// Largest gRPC message, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
@@ -61,6 +88,18 @@ impl Default for ServerConfig {
         let limits = FrameLimits::default();
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            insecure_listen_anywhere: false,
+            tls_cert_file: None,
+            tls_key_file: None,
+            tls_client_ca_file: None,
+            tls_client_crl_file: None,
+            tls_require_client_certificate: false,
+            tls_handshake_timeout_s: 10,
+            max_tls_handshakes: 512,
+            token_keys_file: None,
+            token_issuer: None,
+            token_audience: "lanemap".to_owned(),
+            anonymous_read: false,
             data_dir: PathBuf::from("lanemap-data"),
             max_message_bytes: 32 * 1024 * 1024,
             max_detections: limits.max_detections,
@@ -97,6 +136,27 @@ pub enum ConfigError {
         value: String,
         /// Its range.
         limit: &'static str,
+    },
+    /// A setting means nothing without another.
+    #[error("setting {name} needs {needs}")]
+    Incomplete {
+        /// Name of the setting.
+        name: &'static str,
+        /// What it needs.
+        needs: &'static str,
+    },
+    /// The service would be open to a network.
+    #[error(
+        "{setting} = {address} is reached from other machines, and that needs {missing}; \
+         insecure_listen_anywhere: true does without, in a private network or behind a proxy that has both"
+    )]
+    Exposed {
+        /// Name of the setting.
+        setting: &'static str,
+        /// Where it would listen.
+        address: String,
+        /// What is missing.
+        missing: &'static str,
     },
 }
 
@@ -148,7 +208,28 @@ impl ServerConfig {
         within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
-        within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")
+        within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")?;
+        within("tls_handshake_timeout_s", self.tls_handshake_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("max_tls_handshakes", self.max_tls_handshakes as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        self.check_credentials()?;
+        exposure::check(self)
+    }
+
+    /// Checks that no setting of TLS or tokens stands without those that it needs.
+    fn check_credentials(&self) -> Result<(), ConfigError> {
+        let needs = |name, is_set: bool, met: bool, needs| {
+            if is_set && !met { Err(ConfigError::Incomplete { name, needs }) } else { Ok(()) }
+        };
+        let (certificate, key) = (self.tls_cert_file.is_some(), self.tls_key_file.is_some());
+        let clients = self.tls_client_ca_file.is_some();
+        needs("tls_cert_file", certificate, key, "tls_key_file")?;
+        needs("tls_key_file", key, certificate, "tls_cert_file")?;
+        needs("tls_client_ca_file", clients, certificate, "tls_cert_file and tls_key_file")?;
+        needs("tls_client_crl_file", self.tls_client_crl_file.is_some(), clients, "tls_client_ca_file")?;
+        needs("tls_require_client_certificate", self.tls_require_client_certificate, clients, "tls_client_ca_file")?;
+        let (keys, issuer) = (self.token_keys_file.is_some(), self.token_issuer.is_some());
+        needs("token_keys_file", keys, issuer, "token_issuer")?;
+        needs("token_issuer", issuer, keys, "token_keys_file")
     }
 
     /// The bounds on a frame.
@@ -229,9 +310,9 @@ mod tests {
 
     #[test]
     fn addresses_and_folders_read_from_the_environment() {
-        let environment = environment(&[("LANEMAP_LISTEN", "0.0.0.0:9000"), ("LANEMAP_DATA_DIR", "maps")]);
+        let environment = environment(&[("LANEMAP_LISTEN", "127.0.0.2:9000"), ("LANEMAP_DATA_DIR", "maps")]);
         let settings = ServerConfig::from_sources(None, environment, ConfigOverrides::default()).unwrap();
-        assert_eq!(settings.listen, SocketAddr::from(([0, 0, 0, 0], 9000)));
+        assert_eq!(settings.listen, SocketAddr::from(([127, 0, 0, 2], 9000)));
         assert_eq!(settings.data_dir, PathBuf::from("maps"));
     }
 }

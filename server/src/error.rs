@@ -7,7 +7,12 @@ use thiserror::Error;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::{ingest::Refusal, journal::JournalError, session::SessionId};
+use crate::{
+    auth::{Action, AuthenticationError},
+    ingest::Refusal,
+    journal::JournalError,
+    session::SessionId,
+};
 
 /// A failure that ends a call or a stream.
 #[derive(Clone, Debug, Error)]
@@ -21,9 +26,12 @@ pub enum Error {
         /// The name that was asked for.
         session: String,
     },
-    /// The peer may not do what it asked for. Who asked and for what is not repeated: it may be logged.
-    #[error("this peer may not stream as the vehicle that it names")]
-    NotPermitted,
+    /// Who asks has not shown who it is.
+    #[error("{0}")]
+    Unauthenticated(AuthenticationError),
+    /// Who asks may not do what it asks for. Who it is and for which vehicle it asked is not repeated: it may be logged.
+    #[error("this peer may not {0}")]
+    NotPermitted(Action),
     /// A newer stream of the same drive took over.
     #[error("a newer stream of this drive has taken over")]
     Superseded,
@@ -53,7 +61,8 @@ impl Error {
         match self {
             Self::Refused(_) => Code::InvalidArgument,
             Self::NoSuchSession { .. } => Code::NotFound,
-            Self::NotPermitted => Code::PermissionDenied,
+            Self::Unauthenticated(_) => Code::Unauthenticated,
+            Self::NotPermitted(_) => Code::PermissionDenied,
             Self::Superseded => Code::Aborted,
             Self::ShuttingDown | Self::Journal(_) | Self::SessionGone => Code::Unavailable,
             Self::Unreadable { .. } => Code::DataLoss,

@@ -1,21 +1,34 @@
-//! One port for gRPC and HTTP: accepts connections, bounded in number, and ends them gracefully.
+//! One port for gRPC and HTTP: accepts connections, bounded in number, shakes hands with each in a task of its own, and
+//! ends them gracefully.
 
 use std::{sync::Arc, time::Duration};
 
-use axum::Router;
+use axum::{Extension, Router};
 use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
-    server::{conn::auto::Builder, graceful::GracefulShutdown},
+    server::{
+        conn::auto::Builder,
+        graceful::{GracefulShutdown, Watcher},
+    },
     service::TowerToHyperService,
 };
 use tokio::{
+    io::{AsyncRead, AsyncWrite},
     net::{TcpListener, TcpStream},
     sync::Semaphore,
     time::sleep,
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::{config::ServerConfig, telemetry};
+use crate::{
+    auth::{
+        layer::Connection,
+        tls::{self, Tls},
+    },
+    config::ServerConfig,
+    telemetry,
+};
+use tower::Layer;
 
 /// Pause after a failed accept: out of file descriptors, most likely.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
@@ -25,10 +38,11 @@ pub(crate) async fn serve(
     listener: TcpListener,
     router: Router,
     config: &ServerConfig,
+    tls: Option<Arc<Tls>>,
     stop: CancellationToken,
     deadline: impl Future<Output = ()>,
 ) {
-    let builder = connection_builder(config);
+    let builder = Arc::new(connection_builder(config));
     let graceful = GracefulShutdown::new();
     let abort = CancellationToken::new();
     let places = Arc::new(Semaphore::new(config.max_connections));
@@ -38,16 +52,13 @@ pub(crate) async fn serve(
             accepted = accept(&listener, &places) => accepted,
         };
         let Some((connection, place)) = accepted else { continue };
-        let service = TowerToHyperService::new(router.clone());
-        let serving = builder.serve_connection_with_upgrades(TokioIo::new(connection), service).into_owned();
-        let serving = graceful.watch(serving);
+        let serving =
+            serve_connection(connection, router.clone(), Arc::clone(&builder), tls.clone(), graceful.watcher());
         let abort = abort.clone();
         tokio::spawn(async move {
             metrics::gauge!(telemetry::CONNECTIONS).increment(1.0);
             tokio::select! {
-                served = serving => if let Err(error) = served {
-                    tracing::debug!(error, "a connection broke");
-                },
+                () = serving => {}
                 () = abort.cancelled() => {}
             }
             metrics::gauge!(telemetry::CONNECTIONS).decrement(1.0);
@@ -82,6 +93,43 @@ async fn accept(
             sleep(ACCEPT_PAUSE).await;
             None
         }
+    }
+}
+
+/// Shakes hands where there is TLS, and serves the connection to its end.
+async fn serve_connection(
+    connection: TcpStream,
+    router: Router,
+    builder: Arc<Builder<TokioExecutor>>,
+    tls: Option<Arc<Tls>>,
+    watcher: Watcher,
+) {
+    let Some(tls) = tls else {
+        return serve_requests(connection, Connection { identity: None }, router, &builder, watcher).await;
+    };
+    match tls.accept(connection).await {
+        Ok(stream) => {
+            let identity = tls::identity(&stream).map(Arc::new);
+            serve_requests(stream, Connection { identity }, router, &builder, watcher).await;
+        }
+        Err(error) => {
+            tracing::debug!(%error, "a connection did not come about");
+            metrics::counter!(telemetry::HANDSHAKES_FAILED).increment(1);
+        }
+    }
+}
+
+async fn serve_requests(
+    stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    connection: Connection,
+    router: Router,
+    builder: &Builder<TokioExecutor>,
+    watcher: Watcher,
+) {
+    let service = TowerToHyperService::new(Extension(connection).layer(router));
+    let serving = builder.serve_connection_with_upgrades(TokioIo::new(stream), service).into_owned();
+    if let Err(error) = watcher.watch(serving).await {
+        tracing::debug!(error, "a connection broke");
     }
 }
 

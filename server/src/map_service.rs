@@ -8,6 +8,7 @@ use lanemap_proto::{
 use tonic::{Request, Response, Status};
 
 use crate::{
+    auth::peer_of,
     error::Error,
     session::{PublishedMap, SessionId, SessionState, Sessions},
 };
@@ -66,6 +67,7 @@ impl MapService for MapGrpc {
         &self,
         request: Request<v1::ListSessionsRequest>,
     ) -> Result<Response<v1::ListSessionsResponse>, Status> {
+        peer_of(request.extensions())?.may_read(None)?;
         let v1::ListSessionsRequest { page_size, page_token } = request.into_inner();
         let size = match usize::try_from(page_size).unwrap_or(usize::MAX) {
             0 => DEFAULT_PAGE,
@@ -88,6 +90,7 @@ impl MapService for MapGrpc {
         &self,
         request: Request<v1::GetLaneMapRequest>,
     ) -> Result<Response<v1::GetLaneMapResponse>, Status> {
+        peer_of(request.extensions())?.may_read(None)?;
         let name = request.into_inner().session_id;
         let id: SessionId =
             name.parse().map_err(|_| Error::NoSuchSession { session: name.chars().take(64).collect() })?;

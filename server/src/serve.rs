@@ -42,7 +42,7 @@ use self::{
     extents::Extents,
     problem::{Problem, repeated},
 };
-use crate::session::Sessions;
+use crate::{auth::layer::require_read, session::Sessions};
 
 /// What the HTTP handlers read.
 #[derive(Clone)]
@@ -77,18 +77,23 @@ impl FromRef<Shared> for Extents {
 }
 
 /// Every HTTP route of the service, and the answer to requests that no route takes.
+///
+/// Maps and metrics are for those who may read them; the viewer's page, which holds none, and health are for all.
 pub fn router(state: ServeState) -> Router {
-    Router::new()
+    let readers = Router::new()
         .route("/sessions", get(sessions::list))
         .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
         .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
         .route(items::PATH, get(items::items))
+        .route("/metrics", get(operation::metrics))
+        .route_layer(middleware::from_fn(require_read));
+    Router::new()
+        .merge(readers)
         .route("/viewer", get(viewer::page))
         .route("/viewer/", get(|| async { Redirect::permanent("/viewer") }))
         .route("/viewer/{name}", get(viewer::file))
         .route("/healthz", get(operation::healthz))
         .route("/readyz", get(operation::readyz))
-        .route("/metrics", get(operation::metrics))
         .fallback(no_such_path)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(CompressionLayer::new())

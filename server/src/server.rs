@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
-use axum::Router;
+use axum::{Router, middleware};
 use lanemap_proto::v1::{self, ingest_service_server::IngestServiceServer, map_service_server::MapServiceServer};
 use thiserror::Error;
 use tokio::{
@@ -16,6 +16,10 @@ use tonic::{codec::CompressionEncoding, service::Routes};
 use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
+    auth::{
+        layer::authenticate,
+        reload::{CredentialError, Credentials},
+    },
     config::{ConfigError, ServerConfig},
     ingest::{IngestGrpc, conversation::Conversations},
     journal::{CommitterThread, Journal, JournalError},
@@ -39,6 +43,9 @@ pub enum StartError {
     /// A setting is out of range.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// A file of certificates or keys cannot be used.
+    #[error(transparent)]
+    Credentials(#[from] CredentialError),
     /// The store cannot be opened.
     #[error("the store in {folder}: {source}")]
     Journal {
@@ -72,6 +79,7 @@ pub struct Server;
 pub struct RunningServer {
     address: SocketAddr,
     sessions: Sessions,
+    credentials: Credentials,
     shutdown: CancellationToken,
     task: JoinHandle<()>,
 }
@@ -83,6 +91,8 @@ impl Server {
     /// A setting out of range, a store that cannot be opened, an address that cannot be listened on.
     pub async fn start(config: ServerConfig) -> Result<RunningServer, StartError> {
         config.check()?;
+        let credentials = Credentials::load(&config)?;
+        warn_of_exposure(&config);
         let metrics = telemetry::metrics_handle();
         let config = Arc::new(config);
         let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
@@ -109,12 +119,22 @@ impl Server {
         let conversations =
             Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
         let (health, router) = router(&config, IngestGrpc::new(conversations), http).await?;
+        let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
 
-        let running =
-            Running { config, registry, streams, ready, health, shutdown: shutdown.clone(), journal_failed, committer };
+        let running = Running {
+            config,
+            credentials: credentials.clone(),
+            registry,
+            streams,
+            ready,
+            health,
+            shutdown: shutdown.clone(),
+            journal_failed,
+            committer,
+        };
         let task = tokio::spawn(running.run(listener, router));
         tracing::info!(%address, "serving gRPC and HTTP");
-        Ok(RunningServer { address, sessions, shutdown, task })
+        Ok(RunningServer { address, sessions, credentials, shutdown, task })
     }
 }
 
@@ -128,7 +148,14 @@ impl RunningServer {
     /// The address as a URL, for clients on this machine.
     #[must_use]
     pub fn url(&self) -> String {
-        format!("http://{}", self.address)
+        let scheme = if self.credentials.tls.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}", self.address)
+    }
+
+    /// The certificates and keys in use: a handle to read them anew, e.g. at SIGHUP.
+    #[must_use]
+    pub fn credentials(&self) -> Credentials {
+        self.credentials.clone()
     }
 
     /// The published maps.
@@ -166,6 +193,7 @@ impl Drop for RunningServer {
 /// What a service that runs must stop, in the order in which it stops.
 struct Running {
     config: Arc<ServerConfig>,
+    credentials: Credentials,
     registry: SessionRegistry,
     streams: TaskTracker,
     ready: watch::Sender<bool>,
@@ -193,9 +221,10 @@ impl Running {
             }
         };
         let serving = tokio::spawn({
-            let (config, stop) = (Arc::clone(&self.config), stop_listening.clone());
-            async move { listener::serve(listener, router, &config, stop, overdue).await }
+            let (config, stop, tls) = (Arc::clone(&self.config), stop_listening.clone(), self.credentials.tls.clone());
+            async move { listener::serve(listener, router, &config, tls, stop, overdue).await }
         });
+        let watching = tokio::spawn(self.credentials.clone().watch(stop_listening.clone()));
         let upkeep = tokio::spawn(async {
             loop {
                 sleep(METRICS_UPKEEP).await;
@@ -226,6 +255,7 @@ impl Running {
             tracing::error!(%error, "the listener failed");
         }
         upkeep.abort();
+        watching.abort();
         drop(self.registry);
         if timeout(JOURNAL_GRACE, self.committer.join()).await.is_err() {
             tracing::warn!("the journal was still in use at the end of the grace time");
@@ -242,6 +272,14 @@ fn pseudonyms(config: &ServerConfig, journal: &Journal) -> Result<Pseudonyms, St
         journal.adopt_key(&pseudonyms).map_err(in_store)?;
     }
     Ok(pseudonyms)
+}
+
+/// Says in the log what `insecure_listen_anywhere` permits.
+fn warn_of_exposure(config: &ServerConfig) {
+    let without_permission = ServerConfig { insecure_listen_anywhere: false, ..config.clone() };
+    if let Err(exposure) = without_permission.check() {
+        tracing::warn!("insecure_listen_anywhere is set: {exposure}");
+    }
 }
 
 /// gRPC beside HTTP on one router. Unknown paths are the HTTP side's to answer.

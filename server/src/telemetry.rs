@@ -25,6 +25,10 @@ pub const SESSIONS_LIVE: &str = "lanemap_sessions_live";
 pub const SESSIONS: &str = "lanemap_sessions";
 /// Connections that are open.
 pub const CONNECTIONS: &str = "lanemap_connections";
+/// TLS handshakes that failed or took too long.
+pub const HANDSHAKES_FAILED: &str = "lanemap_tls_handshakes_failed_total";
+/// Requests whose token or certificate was not taken.
+pub const CREDENTIALS_REFUSED: &str = "lanemap_credentials_refused_total";
 /// Poses and local maps dropped because their client did not read them.
 pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 
@@ -67,5 +71,7 @@ fn describe() {
     describe_gauge!(SESSIONS_LIVE, Unit::Count, "Streams of vehicles that are open");
     describe_gauge!(SESSIONS, Unit::Count, "Drives that the store holds");
     describe_gauge!(CONNECTIONS, Unit::Count, "Connections that are open");
+    describe_counter!(HANDSHAKES_FAILED, Unit::Count, "TLS handshakes that failed or took too long");
+    describe_counter!(CREDENTIALS_REFUSED, Unit::Count, "Requests whose token or certificate was not taken");
     describe_counter!(UPDATES_DROPPED, Unit::Count, "Poses and local maps that their client did not read in time");
 }

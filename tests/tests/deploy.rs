@@ -33,6 +33,9 @@ fn shipped_settings() -> ServerConfig {
     ServerConfig {
         listen: "0.0.0.0:8080".parse().unwrap(),
         data_dir: "/var/lib/lanemap".into(),
+        tls_cert_file: Some("/etc/lanemap/tls/server.crt".into()),
+        tls_key_file: Some("/etc/lanemap/tls/server.key".into()),
+        tls_client_ca_file: Some("/etc/lanemap/tls/vehicles-ca.crt".into()),
         ..ServerConfig::default()
     }
 }

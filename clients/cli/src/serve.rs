@@ -19,6 +19,48 @@ pub struct ServeArgs {
     /// Address and port for gRPC and HTTP; port 0 takes any free one [env: LANEMAP_LISTEN] [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDRESS")]
     listen: Option<SocketAddr>,
+    /// Listen beyond the loopback interface although there is no TLS, or peers do not show who they are: in a private
+    /// network, or behind a proxy that does both [env: LANEMAP_INSECURE_LISTEN_ANYWHERE] [default: false]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    insecure_listen_anywhere: Option<bool>,
+    /// Certificates that the service shows, PEM, its own first; with --tls-key-file: TLS on the port, and no plain text
+    /// [env: LANEMAP_TLS_CERT_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    tls_cert_file: Option<PathBuf>,
+    /// Private key of the first of these certificates, PEM [env: LANEMAP_TLS_KEY_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    tls_key_file: Option<PathBuf>,
+    /// Authorities whose client certificates are taken, PEM; a certificate names its vehicle by the URI
+    /// lanemap://fleet/vehicle or the common name fleet/vehicle [env: LANEMAP_TLS_CLIENT_CA_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    tls_client_ca_file: Option<PathBuf>,
+    /// Lists of revoked client certificates, PEM [env: LANEMAP_TLS_CLIENT_CRL_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    tls_client_crl_file: Option<PathBuf>,
+    /// Refuse connections without a client certificate; without this, a bearer token will do
+    /// [env: LANEMAP_TLS_REQUIRE_CLIENT_CERTIFICATE] [default: false]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    tls_require_client_certificate: Option<bool>,
+    /// Time for a TLS handshake, seconds [env: LANEMAP_TLS_HANDSHAKE_TIMEOUT_S] [default: 10]
+    #[arg(long, value_name = "S")]
+    tls_handshake_timeout_s: Option<u64>,
+    /// Most TLS handshakes at a time; more wait [env: LANEMAP_MAX_TLS_HANDSHAKES] [default: 512]
+    #[arg(long, value_name = "N")]
+    max_tls_handshakes: Option<usize>,
+    /// Keys that verify bearer tokens (JWT): a JWKS, or public keys in PEM [env: LANEMAP_TOKEN_KEYS_FILE]
+    /// [default: none]
+    #[arg(long, value_name = "FILE")]
+    token_keys_file: Option<PathBuf>,
+    /// Issuer of bearer tokens, their claim iss [env: LANEMAP_TOKEN_ISSUER] [default: none]
+    #[arg(long, value_name = "ISSUER")]
+    token_issuer: Option<String>,
+    /// Audience of bearer tokens, one of their claim aud [env: LANEMAP_TOKEN_AUDIENCE] [default: lanemap]
+    #[arg(long, value_name = "AUDIENCE")]
+    token_audience: Option<String>,
+    /// Let anybody read maps and metrics, where others show who they are [env: LANEMAP_ANONYMOUS_READ]
+    /// [default: false]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    anonymous_read: Option<bool>,
     /// Folder of the embedded store; made where it does not exist [env: LANEMAP_DATA_DIR] [default: lanemap-data]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
@@ -83,6 +125,18 @@ impl ServeArgs {
     fn overrides(&self) -> ConfigOverrides {
         ConfigOverrides {
             listen: self.listen,
+            insecure_listen_anywhere: self.insecure_listen_anywhere,
+            tls_cert_file: self.tls_cert_file.clone(),
+            tls_key_file: self.tls_key_file.clone(),
+            tls_client_ca_file: self.tls_client_ca_file.clone(),
+            tls_client_crl_file: self.tls_client_crl_file.clone(),
+            tls_require_client_certificate: self.tls_require_client_certificate,
+            tls_handshake_timeout_s: self.tls_handshake_timeout_s,
+            max_tls_handshakes: self.max_tls_handshakes,
+            token_keys_file: self.token_keys_file.clone(),
+            token_issuer: self.token_issuer.clone(),
+            token_audience: self.token_audience.clone(),
+            anonymous_read: self.anonymous_read,
             data_dir: self.data_dir.clone(),
             max_message_bytes: self.max_message_bytes,
             max_detections: self.max_detections,
@@ -104,7 +158,7 @@ impl ServeArgs {
     }
 }
 
-/// Serves until SIGINT or SIGTERM.
+/// Serves until SIGINT or SIGTERM; SIGHUP reads certificates and keys anew.
 #[tokio::main]
 pub async fn run(args: &ServeArgs) -> anyhow::Result<ExitCode> {
     let settings = ServerConfig::load(args.config.as_deref(), args.overrides())
@@ -112,7 +166,10 @@ pub async fn run(args: &ServeArgs) -> anyhow::Result<ExitCode> {
     let stop = signal::stop_signals()?;
     let server = Server::start(settings).await.context("the service does not start")?;
     println!("serving gRPC and HTTP on {url}, viewer at {url}/viewer", url = server.url());
+    let credentials = server.credentials();
+    let reloading = tokio::spawn(signal::at_each_hangup(move || credentials.reload())?);
     stop.await;
+    reloading.abort();
     server.shutdown().await;
     Ok(ExitCode::SUCCESS)
 }
@@ -136,7 +193,11 @@ mod tests {
             let flag = name.replace('_', "-");
             let argument = command.get_arguments().find(|argument| argument.get_long() == Some(flag.as_str()));
             let help = argument.unwrap_or_else(|| panic!("no flag for {name}")).get_help().unwrap().to_string();
-            let default = default.as_str().map_or_else(|| default.to_string(), str::to_owned);
+            let default = match default {
+                serde_json::Value::Null => "none".to_owned(),
+                serde_json::Value::String(text) => text.clone(),
+                other => other.to_string(),
+            };
             assert!(help.contains(&format!("[default: {default}]")), "{name}: {help} lacks {default}");
             assert!(help.contains(&format!("[env: LANEMAP_{}]", name.to_uppercase())), "{name}: {help}");
         }

@@ -1,4 +1,5 @@
-//! Signals that end a service: SIGINT (Ctrl-C) and SIGTERM. A second one ends the process at once.
+//! Signals that end a service: SIGINT (Ctrl-C) and SIGTERM. A second one ends the process at once. SIGHUP has it read its
+//! files anew.
 
 use anyhow::Context;
 
@@ -38,4 +39,22 @@ pub fn stop_signals() -> anyhow::Result<impl Future<Output = ()>> {
             std::process::exit(CUT_SHORT);
         });
     })
+}
+
+/// A future that acts at each SIGHUP, for ever. The signal is caught from this call on.
+#[cfg(unix)]
+pub fn at_each_hangup(act: impl Fn()) -> anyhow::Result<impl Future<Output = ()>> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut hangup = signal(SignalKind::hangup()).context("SIGHUP cannot be caught")?;
+    Ok(async move {
+        while hangup.recv().await.is_some() {
+            act();
+        }
+    })
+}
+
+/// A future that does nothing: there is no SIGHUP here.
+#[cfg(not(unix))]
+pub fn at_each_hangup(_act: impl Fn()) -> anyhow::Result<impl Future<Output = ()>> {
+    Ok(std::future::pending())
 }

@@ -9,6 +9,30 @@ use super::ServerConfig;
 pub struct ConfigOverrides {
     /// See [`ServerConfig::listen`].
     pub listen: Option<SocketAddr>,
+    /// See [`ServerConfig::insecure_listen_anywhere`].
+    pub insecure_listen_anywhere: Option<bool>,
+    /// See [`ServerConfig::tls_cert_file`].
+    pub tls_cert_file: Option<PathBuf>,
+    /// See [`ServerConfig::tls_key_file`].
+    pub tls_key_file: Option<PathBuf>,
+    /// See [`ServerConfig::tls_client_ca_file`].
+    pub tls_client_ca_file: Option<PathBuf>,
+    /// See [`ServerConfig::tls_client_crl_file`].
+    pub tls_client_crl_file: Option<PathBuf>,
+    /// See [`ServerConfig::tls_require_client_certificate`].
+    pub tls_require_client_certificate: Option<bool>,
+    /// See [`ServerConfig::tls_handshake_timeout_s`].
+    pub tls_handshake_timeout_s: Option<u64>,
+    /// See [`ServerConfig::max_tls_handshakes`].
+    pub max_tls_handshakes: Option<usize>,
+    /// See [`ServerConfig::token_keys_file`].
+    pub token_keys_file: Option<PathBuf>,
+    /// See [`ServerConfig::token_issuer`].
+    pub token_issuer: Option<String>,
+    /// See [`ServerConfig::token_audience`].
+    pub token_audience: Option<String>,
+    /// See [`ServerConfig::anonymous_read`].
+    pub anonymous_read: Option<bool>,
     /// See [`ServerConfig::data_dir`].
     pub data_dir: Option<PathBuf>,
     /// See [`ServerConfig::max_message_bytes`].
@@ -48,6 +72,18 @@ pub struct ConfigOverrides {
 impl ConfigOverrides {
     pub(super) fn apply_to(self, settings: &mut ServerConfig) {
         set(&mut settings.listen, self.listen);
+        set(&mut settings.insecure_listen_anywhere, self.insecure_listen_anywhere);
+        set_optional(&mut settings.tls_cert_file, self.tls_cert_file);
+        set_optional(&mut settings.tls_key_file, self.tls_key_file);
+        set_optional(&mut settings.tls_client_ca_file, self.tls_client_ca_file);
+        set_optional(&mut settings.tls_client_crl_file, self.tls_client_crl_file);
+        set(&mut settings.tls_require_client_certificate, self.tls_require_client_certificate);
+        set(&mut settings.tls_handshake_timeout_s, self.tls_handshake_timeout_s);
+        set(&mut settings.max_tls_handshakes, self.max_tls_handshakes);
+        set_optional(&mut settings.token_keys_file, self.token_keys_file);
+        set_optional(&mut settings.token_issuer, self.token_issuer);
+        set(&mut settings.token_audience, self.token_audience);
+        set(&mut settings.anonymous_read, self.anonymous_read);
         set(&mut settings.data_dir, self.data_dir);
         set(&mut settings.max_message_bytes, self.max_message_bytes);
         set(&mut settings.max_detections, self.max_detections);
@@ -71,5 +107,11 @@ impl ConfigOverrides {
 fn set<T>(setting: &mut T, flag: Option<T>) {
     if let Some(value) = flag {
         *setting = value;
+    }
+}
+
+fn set_optional<T>(setting: &mut Option<T>, flag: Option<T>) {
+    if flag.is_some() {
+        *setting = flag;
     }
 }

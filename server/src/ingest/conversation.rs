@@ -17,7 +17,7 @@ use super::{
     decode::{self, PointFrame},
 };
 use crate::{
-    auth::Peer,
+    auth::{AuthenticationError, Peer},
     config::ServerConfig,
     error::Error,
     session::{
@@ -86,7 +86,7 @@ impl Conversations {
         let ending = match self.open(&peer, &mut incoming).await {
             Ok(session) => {
                 outbox.accept(self.accepted(&session));
-                let ending = self.take_messages(&mut incoming, &session).await;
+                let ending = self.take_messages(&peer, &mut incoming, &session).await;
                 self.keep_promises(&outbox, &session, ending.clone()).await;
                 ending
             }
@@ -139,7 +139,7 @@ impl Conversations {
     /// Takes messages until the stream ends; gives what it ends with.
     ///
     /// What a shutdown cuts off here was not acked: the vehicle sends it again.
-    async fn take_messages<M>(&self, incoming: &mut Incoming<M>, session: &OpenSession) -> Ending
+    async fn take_messages<M>(&self, peer: &Peer, incoming: &mut Incoming<M>, session: &OpenSession) -> Ending
     where
         M: Stream<Item = Result<v1::StreamObservationsRequest, Status>> + Unpin,
     {
@@ -155,6 +155,7 @@ impl Conversations {
         tokio::select! {
             biased;
             () = self.shutdown.cancelled() => Err(Error::ShuttingDown.into()),
+            () = peer.expired() => Err(Error::Unauthenticated(AuthenticationError::Expired).into()),
             ending = take_all => ending,
         }
     }

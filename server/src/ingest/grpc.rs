@@ -4,7 +4,7 @@ use lanemap_proto::v1::{self, ingest_service_server::IngestService};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{OutboxStream, conversation::Conversations};
-use crate::auth::Peer;
+use crate::auth::peer_of;
 
 /// The ingest service.
 #[derive(Clone)]
@@ -26,7 +26,7 @@ impl IngestService for IngestGrpc {
         &self,
         request: Request<Streaming<v1::StreamObservationsRequest>>,
     ) -> Result<Response<OutboxStream>, Status> {
-        let peer = peer(&request);
+        let peer = peer_of(request.extensions())?;
         Ok(Response::new(self.conversations.begin(peer, request.into_inner())))
     }
 
@@ -34,12 +34,7 @@ impl IngestService for IngestGrpc {
         &self,
         request: Request<v1::UploadObservationsRequest>,
     ) -> Result<Response<v1::UploadObservationsResponse>, Status> {
-        let peer = peer(&request);
+        let peer = peer_of(request.extensions())?;
         Ok(Response::new(self.conversations.upload(&peer, request.into_inner()).await?))
     }
-}
-
-/// Who calls, as the layers before found out.
-fn peer<T>(request: &Request<T>) -> Peer {
-    request.extensions().get::<Peer>().cloned().unwrap_or_else(Peer::unauthenticated)
 }

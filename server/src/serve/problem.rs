@@ -7,7 +7,11 @@ use axum::{
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::session::SessionId;
+use crate::{
+    auth::{Action, AuthenticationError},
+    error::Error as ServiceError,
+    session::SessionId,
+};
 
 /// Every reason for which the HTTP side refuses.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
@@ -69,6 +73,12 @@ pub enum Problem {
         /// What is wrong.
         reason: String,
     },
+    /// The request does not show who sends it, or not in a way that is taken.
+    #[error("{0}")]
+    Unauthenticated(AuthenticationError),
+    /// Who sends the request may not do what it asks for.
+    #[error("the sender of this request may not {0}")]
+    NotPermitted(Action),
     /// The answer could not be made; the fault is ours.
     #[error("the answer could not be made")]
     Internal,
@@ -105,12 +115,29 @@ impl Problem {
             Self::NoSuchPath { .. } | Self::NoSuchSession { .. } => StatusCode::NOT_FOUND,
             Self::MethodNotAllowed { .. } => StatusCode::METHOD_NOT_ALLOWED,
             Self::NotGeoreferenced { .. } => StatusCode::CONFLICT,
+            Self::Unauthenticated(_) => StatusCode::UNAUTHORIZED,
+            Self::NotPermitted(_) => StatusCode::FORBIDDEN,
             Self::UnknownParameter { .. }
             | Self::RepeatedParameter { .. }
             | Self::BadParameter { .. }
             | Self::BadQuery { .. } => StatusCode::BAD_REQUEST,
             Self::Internal => StatusCode::INTERNAL_SERVER_ERROR,
         }
+    }
+
+    /// What to show, as RFC 6750 says it.
+    fn challenge(&self) -> Option<HeaderValue> {
+        let text = match self {
+            Self::Unauthenticated(AuthenticationError::Missing) => "Bearer realm=\"lanemap\"".to_owned(),
+            Self::Unauthenticated(error) => {
+                format!("Bearer realm=\"lanemap\", error=\"invalid_token\", error_description=\"{error}\"")
+            }
+            Self::NotPermitted(action) => {
+                format!("Bearer realm=\"lanemap\", error=\"insufficient_scope\", scope=\"{}\"", action.scope())
+            }
+            _ => return None,
+        };
+        HeaderValue::from_str(&text).ok()
     }
 
     /// Last part of the problem's type, and its title.
@@ -124,6 +151,8 @@ impl Problem {
             Self::RepeatedParameter { .. } => ("repeated-parameter", "Repeated query parameter"),
             Self::BadParameter { .. } => ("bad-parameter", "Malformed query parameter"),
             Self::BadQuery { .. } => ("bad-query", "Malformed query"),
+            Self::Unauthenticated(_) => ("unauthenticated", "Unauthenticated"),
+            Self::NotPermitted(_) => ("not-permitted", "Not permitted"),
             Self::Internal => ("internal", "Internal error"),
         }
     }
@@ -155,7 +184,25 @@ impl IntoResponse for Problem {
             (header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json")),
             (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
         ];
-        (self.status(), headers, body).into_response()
+        let mut response = (self.status(), headers, body).into_response();
+        if let Some(challenge) = self.challenge() {
+            response.headers_mut().insert(header::WWW_AUTHENTICATE, challenge);
+        }
+        response
+    }
+}
+
+/// What ends a call of gRPC, as it reads over HTTP.
+impl From<ServiceError> for Problem {
+    fn from(error: ServiceError) -> Self {
+        match error {
+            ServiceError::Unauthenticated(error) => Self::Unauthenticated(error),
+            ServiceError::NotPermitted(action) => Self::NotPermitted(action),
+            other => {
+                tracing::error!(error = %other, "an answer could not be made");
+                Self::Internal
+            }
+        }
     }
 }
 

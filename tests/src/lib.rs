@@ -4,9 +4,11 @@
 // A test's plumbing fails loudly; clippy's exemption for tests covers `#[test]` functions only.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::missing_panics_doc)]
 
+pub mod authorities;
 pub mod drives;
 pub mod folders;
 pub mod http;
 pub mod raw_stream;
 pub mod servers;
 pub mod simulated;
+pub mod tokens;

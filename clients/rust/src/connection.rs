@@ -1,275 +1,248 @@
 //! The task behind a session: connects, resumes, sends what is not acked, listens.
 
-use std::{collections::VecDeque, time::Duration};
+use std::{
+    hash::{BuildHasher, RandomState},
+    sync::{Arc, OnceLock},
+    time::Duration,
+};
 
 use lanemap_core::Sequence;
 use lanemap_proto::v1::{
-    self, ingest_service_client::IngestServiceClient, stream_observations_request::Message as Request,
+    self, RefusalReason, stream_observations_request::Message as Request,
     stream_observations_response::Message as Response,
 };
+use prost::Message;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use tokio::{
-    sync::{broadcast, mpsc, oneshot, watch},
-    time::sleep,
+    sync::{broadcast, watch},
+    time::{sleep, timeout},
 };
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tonic::Status;
 
 use crate::{
+    backlog::{Backlog, Leaving, Next},
     error::ClientError,
     event::{self, Event},
+    link::{Link, Stream},
+    reconnect::Reconnect,
     session::SessionSummary,
-    start::SessionStart,
 };
 
-/// Messages between the session and the network.
-const REQUESTS: usize = 16;
-/// Largest answer taken, bytes: a local map is far smaller.
-const MAX_ANSWER_BYTES: usize = 64 * 1024 * 1024;
+/// Bytes of a request around its frame, at most.
+const ENVELOPE_BYTES: usize = 16;
 
-/// What the session's owner asks for.
-#[derive(Debug)]
-pub(crate) enum Outgoing {
-    Frame(v1::Frame),
-    /// The drive is over.
-    End,
-    /// Leave once everything is acked.
-    Close,
-}
-
-/// Frames that are not acked, in the order of sending, and how many of them this stream has sent.
-#[derive(Debug, Default)]
-struct Unacked {
-    frames: VecDeque<v1::Frame>,
-    sent: usize,
-}
-
+/// What a session's task works with.
 pub(crate) struct Connection {
-    channel: Channel,
-    start: SessionStart,
-    outgoing: mpsc::Receiver<Outgoing>,
-    events: broadcast::Sender<Event>,
-    acked: watch::Sender<Option<Sequence>>,
-    accept: Option<oneshot::Sender<v1::SessionAccepted>>,
-    unacked: Unacked,
-    leaving: Option<Leaving>,
+    pub(crate) link: Link,
+    pub(crate) start: v1::SessionStart,
+    pub(crate) backlog: Arc<Backlog>,
+    pub(crate) events: broadcast::Sender<Event>,
+    pub(crate) acked: watch::Sender<Option<Sequence>>,
+    /// Set when the service accepts the session for the first time.
+    pub(crate) accepted: Arc<OnceLock<v1::SessionAccepted>>,
+    /// Tells that it is set.
+    pub(crate) opened: watch::Sender<bool>,
+    pub(crate) max_unacked: usize,
+    pub(crate) reconnect: Reconnect,
+    pub(crate) open_timeout: Duration,
+    /// Whether a first connection that fails is tried again, as a later one is.
+    pub(crate) patient: bool,
+}
+
+/// The task's own state.
+struct Task {
+    with: Connection,
+    limits: v1::IngestLimits,
+    /// Tries without any progress since.
+    tries: u32,
+    random: ChaCha8Rng,
     summary: SessionSummary,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Leaving {
-    End,
-    Close,
-}
-
-/// One open stream.
-struct Stream {
-    requests: Option<mpsc::Sender<v1::StreamObservationsRequest>>,
-    answers: Streaming<v1::StreamObservationsResponse>,
-}
-
-/// What was sent.
-#[derive(PartialEq, Eq)]
-enum Sent {
-    Frame,
-    /// The end: nothing comes after it.
-    Last,
 }
 
 /// How a stream ended.
 enum Outcome {
-    /// As asked.
-    Done,
-    /// It broke after it had been open.
+    /// As asked; whether the drive is over.
+    Done { ended: bool },
+    /// It broke.
     Broken(ClientError),
 }
 
-impl Unacked {
-    /// Forgets what is durable.
-    fn acked(&mut self, sequence: Sequence) {
-        while self.frames.front().is_some_and(|frame| frame.sequence <= sequence.0) {
-            self.frames.pop_front();
-            self.sent = self.sent.saturating_sub(1);
+impl Connection {
+    /// Runs until the session ends as asked, or fails for good.
+    pub(crate) async fn run(self) -> Result<SessionSummary, ClientError> {
+        let backlog = Arc::clone(&self.backlog);
+        let syncing = backlog.keep_synced();
+        // Randomly seeded, as the standard library's hash maps are.
+        let random = ChaCha8Rng::seed_from_u64(RandomState::new().hash_one(0));
+        let limits = v1::IngestLimits::default();
+        let mut task = Task { with: self, limits, tries: 0, random, summary: SessionSummary::default() };
+        let outcome = task.run().await;
+        if let Some(syncing) = syncing {
+            syncing.abort();
         }
-    }
-
-    /// Forgets a frame that was refused: the oldest of its number that was sent.
-    fn refused(&mut self, sequence: u64) {
-        if let Some(index) = self.frames.iter().take(self.sent).position(|frame| frame.sequence == sequence) {
-            self.frames.remove(index);
-            self.sent -= 1;
-        }
-    }
-
-    fn next_to_send(&self) -> Option<&v1::Frame> {
-        self.frames.get(self.sent)
+        let closed = backlog.close(matches!(outcome, Ok(true))).await;
+        outcome?;
+        closed?;
+        Ok(task.summary)
     }
 }
 
-impl Connection {
-    pub(crate) fn new(
-        channel: Channel,
-        start: SessionStart,
-        outgoing: mpsc::Receiver<Outgoing>,
-        events: broadcast::Sender<Event>,
-        acked: watch::Sender<Option<Sequence>>,
-        accept: oneshot::Sender<v1::SessionAccepted>,
-    ) -> Self {
-        Self {
-            channel,
-            start,
-            outgoing,
-            events,
-            acked,
-            accept: Some(accept),
-            unacked: Unacked::default(),
-            leaving: None,
-            summary: SessionSummary::default(),
-        }
-    }
-
-    /// Runs until the session ends as asked, or fails for good.
-    pub(crate) async fn run(mut self) -> Result<SessionSummary, ClientError> {
-        let mut tries = 0;
+impl Task {
+    /// Whether the drive is over and delivered.
+    async fn run(&mut self) -> Result<bool, ClientError> {
         loop {
-            let error = match self.open().await {
-                Ok(None) => return Ok(self.summary),
-                Ok(Some(stream)) => {
-                    tries = 0;
-                    match self.serve(stream).await {
-                        Outcome::Done => return Ok(self.summary),
-                        Outcome::Broken(error) => error,
-                    }
-                }
-                Err(error) => error,
+            let error = match self.one_stream().await {
+                Outcome::Done { ended } => return Ok(ended),
+                Outcome::Broken(error) => error,
             };
-            // Before the session was ever accepted, its owner decides whether to try again.
-            if !error.is_transient() || self.accept.is_some() || tries >= self.start.reconnect.max_tries {
+            let first = self.with.accepted.get().is_none();
+            let renews = error.is_unauthenticated() && self.with.link.may_renew_token() && !first;
+            if !(error.is_transient() || renews)
+                || (first && !self.with.patient)
+                || self.tries >= self.with.reconnect.max_tries
+            {
                 return Err(error);
             }
-            self.tell(Event::Disconnected { reason: error.to_string() });
-            self.summary.reconnections += 1;
-            sleep(self.pause(tries)).await;
-            tries += 1;
+            let pause = self.with.reconnect.pause(self.tries, error.retry_after(), &mut self.random);
+            self.tell(Event::Disconnected { reason: error.to_string(), retry_in: pause });
+            self.summary.reconnections += u64::from(!first);
+            self.tries += 1;
+            sleep(pause).await;
         }
     }
 
-    fn pause(&self, tries: u32) -> Duration {
-        let reconnect = &self.start.reconnect;
-        reconnect.first_pause.saturating_mul(1 << tries.min(16)).min(reconnect.longest_pause)
+    async fn one_stream(&mut self) -> Outcome {
+        let opened = timeout(self.with.open_timeout, self.open()).await;
+        let too_late = || Err(Status::unavailable("the session was not accepted in time").into());
+        match opened.unwrap_or_else(|_| too_late()) {
+            Ok(Some(stream)) => self.serve(stream).await.unwrap_or_else(Outcome::Broken),
+            Ok(None) => Outcome::Done { ended: true },
+            Err(error) => Outcome::Broken(error),
+        }
     }
 
     /// Opens a stream and waits until the session is accepted; `None` where the drive is over and done.
     async fn open(&mut self) -> Result<Option<Stream>, ClientError> {
-        let (requests, messages) = mpsc::channel(REQUESTS);
-        let start = Request::Start(self.start.to_wire());
-        requests.send(request(start)).await.map_err(|_| ClientError::Ended)?;
-        let mut client = IngestServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_ANSWER_BYTES);
-        let mut answers = client.stream_observations(ReceiverStream::new(messages)).await?.into_inner();
-        let accepted = match answers.message().await?.and_then(|answer| answer.message) {
+        let start = request(Request::Start(self.with.start.clone()));
+        let mut stream = self.with.link.open(start).await?;
+        let accepted = match stream.answer().await? {
             Some(Response::Accepted(accepted)) => accepted,
             Some(Response::Refusal(refusal)) => return Err(ClientError::Refused(Box::new(refusal))),
             Some(other) => return Err(ClientError::Protocol(format!("{other:?} before the session was accepted"))),
             None => return Err(Status::unavailable("the stream ended before the session was accepted").into()),
         };
-        self.resume(accepted.resume_after_sequence.map(Sequence));
-        let over = accepted.ended && self.leaving == Some(Leaving::End) && self.unacked.frames.is_empty();
-        if let Some(accept) = self.accept.take() {
-            // The owner may have gone meanwhile: then the next command's channel is closed, and the session is left.
-            let _ = accept.send(accepted);
-        }
-        Ok((!over).then_some(Stream { requests: Some(requests), answers }))
+        self.resume(&accepted).await?;
+        let over = accepted.ended && self.with.backlog.leaving() == Some(Leaving::End) && self.with.backlog.is_empty();
+        // The first one counts.
+        let _ = self.with.accepted.set(accepted);
+        self.with.opened.send_replace(true);
+        Ok((!over).then_some(stream))
     }
 
-    fn resume(&mut self, resume_after: Option<Sequence>) {
-        self.unacked.sent = 0;
+    async fn resume(&mut self, accepted: &v1::SessionAccepted) -> Result<(), ClientError> {
+        self.limits = accepted.limits.unwrap_or_default();
+        self.with.backlog.rewind();
+        let resume_after = accepted.resume_after_sequence.map(Sequence);
         if let Some(sequence) = resume_after {
-            self.note_acked(sequence);
+            self.note_acked(sequence).await?;
         }
         self.tell(Event::Opened { resume_after });
+        Ok(())
+    }
+
+    /// Frames that may be sent and not acked: the owner's bound or the service's, whichever is less.
+    fn window(&self) -> usize {
+        let theirs = match self.limits.max_frames_in_flight {
+            0 => usize::MAX,
+            frames => frames as usize,
+        };
+        self.with.max_unacked.min(theirs).max(1)
     }
 
     /// Sends and listens until the stream ends.
-    async fn serve(&mut self, mut stream: Stream) -> Outcome {
+    async fn serve(&mut self, mut stream: Stream) -> Result<Outcome, ClientError> {
+        let backlog = Arc::clone(&self.with.backlog);
+        let mut ready = None;
+        let mut left = false;
         loop {
-            let room = self.leaving.is_none() && self.unacked.frames.len() < self.start.max_unacked.max(1);
-            let to_send = self.unacked.next_to_send().is_some() || self.leaving.is_some();
+            if ready.is_none() && !left {
+                ready = self.next().await?;
+            }
             tokio::select! {
-                outgoing = self.outgoing.recv(), if room => self.take(outgoing),
-                permit = reserve(stream.requests.clone()), if to_send => {
-                    if self.send_next(permit) == Sent::Last {
-                        stream.requests = None;
+                permit = stream.reserve(), if ready.is_some() => match ready.take() {
+                    Some(Next::Frame(frame)) => {
+                        permit.send(request(Request::Frame(frame)));
                     }
-                }
-                answer = stream.answers.message() => match answer {
-                    Ok(Some(answer)) => {
-                        if let Err(error) = self.hear(answer.message) {
-                            return Outcome::Broken(error);
+                    leaving => {
+                        if leaving == Some(Next::Leave(Leaving::End)) {
+                            permit.send(request(Request::End(v1::SessionEnd {})));
                         }
+                        stream.close_sending();
+                        left = true;
                     }
-                    Ok(None) if self.is_done() => return Outcome::Done,
-                    Ok(None) => return Outcome::Broken(Status::unavailable("the stream ended").into()),
-                    Err(status) => return Outcome::Broken(status.into()),
                 },
+                answer = stream.answer() => match answer? {
+                    Some(answer) => self.hear(answer).await?,
+                    None if left && backlog.is_empty() => {
+                        return Ok(Outcome::Done { ended: backlog.leaving() == Some(Leaving::End) });
+                    }
+                    None => return Err(Status::unavailable("the stream ended").into()),
+                },
+                () = backlog.filled(), if ready.is_none() && !left => {}
             }
         }
     }
 
-    fn is_done(&self) -> bool {
-        self.leaving.is_some() && self.unacked.frames.is_empty()
-    }
-
-    /// Sends the next frame, or, after the last one, the end.
-    fn send_next(&mut self, permit: mpsc::OwnedPermit<v1::StreamObservationsRequest>) -> Sent {
-        if let Some(frame) = self.unacked.next_to_send() {
-            permit.send(request(Request::Frame(frame.clone())));
-            self.unacked.sent += 1;
-            return Sent::Frame;
-        }
-        if self.leaving == Some(Leaving::End) {
-            permit.send(request(Request::End(v1::SessionEnd {})));
-        }
-        Sent::Last
-    }
-
-    fn take(&mut self, outgoing: Option<Outgoing>) {
-        match outgoing {
-            Some(Outgoing::Frame(frame)) => self.unacked.frames.push_back(frame),
-            Some(Outgoing::End) => self.leaving = Some(Leaving::End),
-            Some(Outgoing::Close) | None => self.leaving = Some(Leaving::Close),
+    /// What is to be sent next. A frame that the service would never take is refused here, as the service would: it must
+    /// not keep those behind it.
+    async fn next(&mut self) -> Result<Option<Next>, ClientError> {
+        loop {
+            let next = self.with.backlog.next(self.window()).await?;
+            let limit = self.limits.max_message_bytes;
+            match next {
+                Some(Next::Frame(frame)) if limit > 0 && (frame.encoded_len() + ENVELOPE_BYTES) as u64 > limit => {
+                    self.hear(Response::Refusal(too_large(&frame, limit))).await?;
+                }
+                next => return Ok(next),
+            }
         }
     }
 
-    fn hear(&mut self, message: Option<Response>) -> Result<(), ClientError> {
-        match message {
-            Some(Response::Ack(ack)) => self.note_acked(Sequence(ack.acked_sequence_inclusive)),
-            Some(Response::Refusal(refusal)) => {
+    async fn hear(&mut self, answer: Response) -> Result<(), ClientError> {
+        // The connection carries something: a next break starts counting anew.
+        self.tries = 0;
+        match answer {
+            Response::Ack(ack) => self.note_acked(Sequence(ack.acked_sequence_inclusive)).await?,
+            Response::Refusal(refusal) => {
                 if let Some(sequence) = refusal.sequence {
-                    self.unacked.refused(sequence);
+                    self.with.backlog.refused(sequence).await?;
                 }
                 self.summary.refused += 1;
                 self.tell(Event::Refused(refusal));
             }
-            Some(Response::Pose(pose)) => self.tell(Event::Pose(Box::new(event::pose(&pose)?))),
-            Some(Response::LocalMap(map)) => self.tell(Event::LocalMap(event::local_map(&map)?)),
-            // gRPC says by its status how a stream ends.
-            Some(Response::Ended(_) | Response::Closed(_)) | None => {}
-            Some(Response::Accepted(_)) => {
+            Response::Pose(pose) => self.tell(Event::Pose(Box::new(event::pose(&pose)?))),
+            Response::LocalMap(map) => self.tell(Event::LocalMap(event::local_map(&map)?)),
+            // How a stream ends, its transport says.
+            Response::Ended(_) | Response::Closed(_) => {}
+            Response::Accepted(_) => {
                 return Err(ClientError::Protocol("a session was accepted twice".to_owned()));
             }
         }
         Ok(())
     }
 
-    fn note_acked(&mut self, sequence: Sequence) {
-        self.unacked.acked(sequence);
+    async fn note_acked(&mut self, sequence: Sequence) -> Result<(), ClientError> {
+        self.with.backlog.acked(sequence.0).await?;
         self.summary.acked = Some(sequence);
-        self.acked.send_replace(Some(sequence));
+        self.with.acked.send_replace(Some(sequence));
         self.tell(Event::Acked(sequence));
+        Ok(())
     }
 
     fn tell(&self, event: Event) {
         // Nobody need listen.
-        let _ = self.events.send(event);
+        let _ = self.with.events.send(event);
     }
 }
 
@@ -277,40 +250,14 @@ fn request(message: Request) -> v1::StreamObservationsRequest {
     v1::StreamObservationsRequest { message: Some(message) }
 }
 
-/// Room for one message; waits for ever where the sending side is closed: the answers tell why.
-async fn reserve(
-    requests: Option<mpsc::Sender<v1::StreamObservationsRequest>>,
-) -> mpsc::OwnedPermit<v1::StreamObservationsRequest> {
-    if let Some(requests) = requests
-        && let Ok(permit) = requests.reserve_owned().await
-    {
-        return permit;
-    }
-    std::future::pending().await
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn unacked(sequences: &[u64], sent: usize) -> Unacked {
-        let frames = sequences.iter().map(|&sequence| v1::Frame { sequence, ..v1::Frame::default() }).collect();
-        Unacked { frames, sent }
-    }
-
-    #[test]
-    fn what_is_acked_is_forgotten_and_the_rest_stays_in_order() {
-        let mut unacked = unacked(&[1, 2, 3, 4], 3);
-        unacked.acked(Sequence(2));
-        assert_eq!(unacked.frames.iter().map(|frame| frame.sequence).collect::<Vec<_>>(), [3, 4]);
-        assert_eq!(unacked.next_to_send().map(|frame| frame.sequence), Some(4));
-    }
-
-    #[test]
-    fn a_refused_frame_is_not_sent_again() {
-        let mut unacked = unacked(&[1, 2, 3], 2);
-        unacked.refused(2);
-        unacked.sent = 0;
-        assert_eq!(unacked.frames.iter().map(|frame| frame.sequence).collect::<Vec<_>>(), [1, 3]);
+fn too_large(frame: &v1::Frame, limit: u64) -> v1::Refusal {
+    let (value, limit) = (format!("{} bytes", frame.encoded_len()), format!("messages of at most {limit} bytes"));
+    v1::Refusal {
+        sequence: Some(frame.sequence),
+        reason: RefusalReason::TooMany.into(),
+        field: "frame".to_owned(),
+        message: format!("frame {}: frame is {value}, limit: {limit}", frame.sequence),
+        value,
+        limit,
     }
 }

@@ -1,8 +1,13 @@
 //! What can go wrong for a client.
 
+use std::time::Duration;
+
 use lanemap_proto::{decode::DecodeError, v1::Refusal};
 use thiserror::Error;
 use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+use crate::spool::SpoolError;
 
 /// Why a call of the client failed.
 #[derive(Clone, Debug, Error)]
@@ -40,6 +45,12 @@ pub enum ClientError {
         /// What the service says about it.
         detail: String,
     },
+    /// A certificate or a token cannot be used.
+    #[error("{0}")]
+    Credentials(String),
+    /// The spool does not do what was asked of it. Where it is [`SpoolError::Full`], the session goes on.
+    #[error(transparent)]
+    Spool(#[from] SpoolError),
     /// The session has ended.
     #[error("the session has ended")]
     Ended,
@@ -53,10 +64,28 @@ impl ClientError {
             Self::Unreachable(_) => true,
             // `Unknown` and `Cancelled` are what tonic makes of a connection that breaks in the middle of a stream.
             Self::Status(status) => {
-                matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal)
+                use Code::{Cancelled, DeadlineExceeded, Internal, ResourceExhausted, Unavailable, Unknown};
+                matches!(
+                    status.code(),
+                    Unavailable | Unknown | Cancelled | Internal | ResourceExhausted | DeadlineExceeded
+                )
             }
             _ => false,
         }
+    }
+
+    /// How long the service wants to be left alone, where it said so.
+    #[must_use]
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Status(status) => status.get_details_retry_info().and_then(|info| info.retry_delay),
+            _ => None,
+        }
+    }
+
+    /// Whether the service did not believe who the client is.
+    pub(crate) fn is_unauthenticated(&self) -> bool {
+        matches!(self, Self::Status(status) if status.code() == Code::Unauthenticated)
     }
 }
 

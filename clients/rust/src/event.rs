@@ -1,5 +1,7 @@
 //! What a session hears from the service.
 
+use std::time::Duration;
+
 use lanemap_core::{
     LaneId, LocalLane, Sequence,
     geometry::{Pose, TangentCovariance},
@@ -26,10 +28,12 @@ pub enum Event {
     Pose(Box<VehiclePose>),
     /// The map around the vehicle.
     LocalMap(LocalMap),
-    /// The connection broke; the client connects anew.
+    /// The connection broke, or could not be made; the client tries again.
     Disconnected {
         /// Why.
         reason: String,
+        /// After which pause.
+        retry_in: Duration,
     },
     /// Events were lost because they were not read in time.
     Missed(u64),

@@ -15,18 +15,45 @@
 //! ```
 //!
 //! A session outlives its connection: where that breaks, the client connects anew, resumes the drive, and sends again
-//! what was not acked. At most [`SessionStart::max_unacked`] frames are kept for that.
+//! what was not acked. At most [`SessionStart::max_unacked`] frames are kept in memory for that. With a spool
+//! ([`SessionStart::spool`]) frames wait on disk, outlive the process, and may be taken before the service can be reached:
+//!
+//! ```no_run
+//! use lanemap_client::{ConnectOptions, IngestClient, Reconnect, SessionStart, SpoolOptions};
+//! # async fn example(frame: lanemap_core::Frame) -> Result<(), lanemap_client::ClientError> {
+//! let spool = SpoolOptions::new("/var/lib/vehicle/spool");
+//! let client = IngestClient::offline("http://lanemap.example:8080", ConnectOptions::default()).await?;
+//! let drive = SessionStart {
+//!     spool: Some(spool.clone()),
+//!     reconnect: Reconnect::forever(),
+//!     ..SessionStart::new("fleet", "vehicle", "drive-2")
+//! };
+//! let (mut session, _events) = client.begin_session(drive).await?;
+//! session.send(&frame).await?; // survives `kill -9` from here on
+//! client.deliver_spooled(&spool).await?; // what is left of earlier drives
+//! # Ok(())
+//! # }
+//! ```
 
+mod backlog;
 mod connection;
+mod credentials;
 mod error;
 mod event;
+mod link;
 mod maps;
+mod reconnect;
 mod session;
+mod spool;
 mod start;
 
+pub use credentials::{Credentials, IdentityFiles, Token};
 pub use error::ClientError;
 pub use event::{Event, Events, LocalMap, VehiclePose};
 pub use lanemap_proto::v1::{Refusal, RefusalReason};
+pub use link::ConnectOptions;
 pub use maps::MapClient;
+pub use reconnect::Reconnect;
 pub use session::{IngestClient, Session, SessionSummary};
-pub use start::{Reconnect, SessionStart};
+pub use spool::{SpoolError, SpoolOptions, SpoolRecovery, SpoolSync, SpooledDrive, WhenFull};
+pub use start::SessionStart;

@@ -1,9 +1,12 @@
 //! How a session starts.
 
-use std::time::Duration;
-
 use lanemap_core::{Preset, Sensor};
 use lanemap_proto::{encode, v1};
+
+use crate::{reconnect::Reconnect, spool::SpoolOptions};
+
+/// Frames unacked where the owner says nothing.
+pub(crate) const MAX_UNACKED: usize = 64;
 
 /// Which drive to stream, and how it is mapped.
 #[derive(Clone, Debug, PartialEq)]
@@ -20,28 +23,13 @@ pub struct SessionStart {
     pub sensor: Sensor,
     /// Whether [`Event::LocalMap`](crate::Event::LocalMap) is wanted after every frame.
     pub wants_local_map: bool,
-    /// Most frames unacked, at least 1: what is kept in memory to be sent again.
+    /// Most frames sent and not acked, at least 1; fewer where the service says so. Without a spool these are also the
+    /// frames kept, in memory, to be sent again.
     pub max_unacked: usize,
     /// What to do when the connection breaks.
     pub reconnect: Reconnect,
-}
-
-/// How often, and for how long, a broken connection is tried again. The pause doubles from try to try.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Reconnect {
-    /// Tries without any answer before the session fails; 0: a broken connection ends the session.
-    pub max_tries: u32,
-    /// Pause before the first try.
-    pub first_pause: Duration,
-    /// Longest pause.
-    pub longest_pause: Duration,
-}
-
-impl Default for Reconnect {
-    /// Ten tries: about half a minute.
-    fn default() -> Self {
-        Self { max_tries: 10, first_pause: Duration::from_millis(100), longest_pause: Duration::from_secs(5) }
-    }
+    /// Where frames wait on disk until they are acked; `None`: in memory.
+    pub spool: Option<SpoolOptions>,
 }
 
 impl SessionStart {
@@ -55,8 +43,9 @@ impl SessionStart {
             preset: Preset::Default,
             sensor: Sensor::default(),
             wants_local_map: false,
-            max_unacked: 64,
+            max_unacked: MAX_UNACKED,
             reconnect: Reconnect::default(),
+            spool: None,
         }
     }
 

@@ -112,7 +112,9 @@ async fn collect_refusals(mut events: Events, refusals: Arc<Mutex<Vec<String>>>)
                     refusals.push(refusal.message);
                 }
             }
-            Event::Disconnected { reason } => tracing::warn!("the connection broke, trying again: {reason}"),
+            Event::Disconnected { reason, retry_in } => {
+                tracing::warn!("the connection broke, trying again in {} ms: {reason}", retry_in.as_millis());
+            }
             _ => {}
         }
     }

@@ -1,0 +1,57 @@
+//! Who reads maps, and what is for all.
+
+use lanemap_proto::v1::{self, map_service_client::MapServiceClient};
+use lanemap_server::ServerConfig;
+use reqwest::{StatusCode, header};
+use serde_json::{Value, json};
+use tonic::Code;
+
+use super::{Secured, assert_code, car, with_token};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn maps_and_metrics_are_for_readers_and_health_is_for_all() {
+    let service = Secured::start(|config| config).await;
+    let reader = service.issuer.token(json!({ "scope": "read" }));
+    let vehicle = car(&service.issuer, "car-1");
+    for path in ["/sessions", "/collections/lanes/items", "/metrics", "/sessions/0123456789abcdef/lanes.pb"] {
+        let refused = service.get(path, None).await;
+        assert_eq!(refused.status(), StatusCode::UNAUTHORIZED, "{path}");
+        assert_eq!(refused.headers()[header::WWW_AUTHENTICATE], "Bearer realm=\"lanemap\"");
+        assert_eq!(refused.headers()[header::CONTENT_TYPE], "application/problem+json");
+        let problem: Value = refused.json().await.unwrap();
+        assert_eq!(
+            (&problem["status"], &problem["type"]),
+            (&json!(401), &json!("urn:lanemap:problem:unauthenticated"))
+        );
+
+        let refused = service.get(path, Some("not.a.token")).await;
+        assert_eq!(refused.status(), StatusCode::UNAUTHORIZED, "{path}");
+        let challenge = refused.headers()[header::WWW_AUTHENTICATE].to_str().unwrap().to_owned();
+        assert!(challenge.contains("error=\"invalid_token\""), "{challenge}");
+
+        let refused = service.get(path, Some(&vehicle)).await;
+        assert_eq!(refused.status(), StatusCode::FORBIDDEN, "{path}");
+        let challenge = refused.headers()[header::WWW_AUTHENTICATE].to_str().unwrap().to_owned();
+        assert!(challenge.contains("insufficient_scope") && challenge.contains("scope=\"read\""), "{challenge}");
+        assert_eq!(refused.json::<Value>().await.unwrap()["type"], "urn:lanemap:problem:not-permitted");
+    }
+    for path in ["/sessions", "/metrics", "/collections/lanes/items"] {
+        assert_eq!(service.get(path, Some(&reader)).await.status(), StatusCode::OK, "{path}");
+    }
+    for path in ["/healthz", "/readyz", "/viewer"] {
+        assert_eq!(service.get(path, None).await.status(), StatusCode::OK, "{path}");
+    }
+    let mut maps = MapServiceClient::new(service.channel(None).await);
+    let list = v1::ListSessionsRequest::default;
+    assert_code(maps.list_sessions(with_token(list(), None)).await, Code::Unauthenticated);
+    assert_code(maps.list_sessions(with_token(list(), Some(&vehicle))).await, Code::PermissionDenied);
+    maps.list_sessions(with_token(list(), Some(&reader))).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn anybody_reads_where_that_is_set_and_streams_all_the_same_not() {
+    let service = Secured::start(|config| ServerConfig { anonymous_read: true, ..config }).await;
+    assert_eq!(service.get("/sessions", None).await.status(), StatusCode::OK);
+    assert_eq!(service.get("/metrics", None).await.status(), StatusCode::OK);
+    assert_code(service.upload_as("car-1", None, None).await, Code::Unauthenticated);
+}

@@ -1,0 +1,114 @@
+//! What no log shows.
+
+use std::{
+    io::{BufRead, BufReader, Read},
+    process::{Child, Command, Stdio},
+};
+
+use jsonwebtoken::{Algorithm, EncodingKey, Header, encode};
+use lanemap_tests::{
+    authorities::TlsFolder,
+    tokens::{self, completed},
+};
+use reqwest::StatusCode;
+use serde_json::json;
+use tokio::time::timeout;
+use tonic::Code;
+
+use super::{PATIENCE, assert_code, upload};
+
+/// `lanemap serve` with everything logged that can be.
+struct LoggedServer {
+    child: Child,
+    url: String,
+}
+
+impl LoggedServer {
+    fn start(arguments: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"))
+            .args(["serve", "--listen", "127.0.0.1:0"])
+            .args(arguments)
+            .env("RUST_LOG", "trace")
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut said = String::new();
+        let mut byte = [0];
+        let stdout = child.stdout.as_mut().unwrap();
+        while !said.ends_with('\n') && stdout.read(&mut byte).unwrap() == 1 {
+            said.push(char::from(byte[0]));
+        }
+        let url = said.split([' ', ',']).find(|word| word.starts_with("http")).expect("no URL").to_owned();
+        Self { child, url }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_token_key_or_vehicle_shows_in_a_log_however_much_is_logged() {
+    let folder = tempfile::tempdir().unwrap();
+    let tls = TlsFolder::new(folder.path());
+    let secret = "a-shared-secret-that-nobody-must-ever-read";
+    let encoded = "YS1zaGFyZWQtc2VjcmV0LXRoYXQtbm9ib2R5LW11c3QtZXZlci1yZWFk";
+    let keys = json!({ "keys": [{ "kty": "oct", "kid": "s", "k": encoded }] }).to_string();
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    tls.write("keys.json", &keys);
+    let arguments: Vec<String> = [
+        ("--data-dir", "data"),
+        ("--tls-cert-file", "server.crt"),
+        ("--tls-key-file", "server.key"),
+        ("--tls-client-ca-file", "vehicles-ca.crt"),
+        ("--token-keys-file", "keys.json"),
+    ]
+    .iter()
+    .flat_map(|(flag, name)| [(*flag).to_owned(), file(name)])
+    .chain(["--token-issuer".to_owned(), tokens::ISSUER.to_owned()])
+    .collect();
+    let arguments: Vec<_> = arguments.iter().map(String::as_str).collect();
+    let mut server = LoggedServer::start(&arguments);
+    let stderr = BufReader::new(server.child.stderr.take().unwrap());
+    let (reloaded, mut reloads) = tokio::sync::mpsc::unbounded_channel();
+    let log = std::thread::spawn(move || {
+        let mut log = String::new();
+        for line in stderr.lines() {
+            let line = line.unwrap();
+            if line.contains("credentials were not read anew") {
+                let _ = reloaded.send(());
+            }
+            log.push_str(&line);
+            log.push('\n');
+        }
+        log
+    });
+
+    let header = Header { kid: Some("s".to_owned()), ..Header::new(Algorithm::HS256) };
+    let claims = completed(json!({ "fleet": "north", "vehicle": "vehicle-of-secrets", "scope": "ingest read" }));
+    let token = encode(&header, &claims, &EncodingKey::from_secret(secret.as_bytes())).unwrap();
+    let client = tls.vehicles.vehicle("north", "vehicle-of-secrets", 3);
+    let channel = tls.channel(&server.url, Some(&client)).await.unwrap();
+    upload(channel.clone(), "north", "vehicle-of-secrets", Some(&token)).await.unwrap();
+    upload(channel.clone(), "north", "vehicle-of-secrets", None).await.unwrap();
+    assert_code(upload(channel.clone(), "north", "other-of-secrets", Some(&token)).await, Code::PermissionDenied);
+    let wrong = format!("{token}x");
+    assert_code(upload(channel, "north", "vehicle-of-secrets", Some(&wrong)).await, Code::Unauthenticated);
+    let http = reqwest::Client::builder().tls_backend_preconfigured(tls.client_tls(None)).build().unwrap();
+    let url = server.url.replace("127.0.0.1", "localhost");
+    let read = http.get(format!("{url}/healthz")).bearer_auth(&token).send().await.unwrap();
+    assert_eq!(read.status(), StatusCode::OK);
+    // What is wrong with a file is logged, what stands in it is not.
+    tls.write("keys.json", &keys.replace(']', ""));
+    let pid = server.child.id().to_string();
+    assert!(Command::new("kill").args(["-HUP", &pid]).status().unwrap().success());
+    timeout(PATIENCE, reloads.recv()).await.expect("SIGHUP changes nothing");
+    server.child.kill().unwrap();
+    server.child.wait().unwrap();
+
+    let log = log.join().unwrap();
+    assert!(log.lines().count() > 100, "nothing is logged: {log}");
+    let signature = token.rsplit('.').next().unwrap();
+    let payload = token.split('.').nth(1).unwrap();
+    for secret in [&token, signature, payload, secret, encoded, "of-secrets", tls.servers.server(1).key.as_str()] {
+        let shown = log.lines().find(|line| line.contains(secret));
+        assert!(shown.is_none(), "{secret} shows in {shown:?}");
+    }
+}

@@ -227,3 +227,58 @@ impl std::fmt::Debug for VerificationKey {
         formatter.debug_struct("VerificationKey").field("algorithm", &self.algorithm).finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn jwks(keys: &serde_json::Value) -> Result<KeySet, KeyError> {
+        KeySet::parse(json!({ "keys": keys }).to_string().as_bytes())
+    }
+
+    fn secret(extra: &serde_json::Value) -> serde_json::Value {
+        let mut key = json!({ "kty": "oct", "k": "MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE" });
+        key.as_object_mut().unwrap().extend(extra.as_object().unwrap().clone());
+        key
+    }
+
+    #[test]
+    fn keys_that_are_not_for_signatures_are_passed_over() {
+        let others = json!([
+            secret(&json!({ "use": "enc" })),
+            secret(&json!({ "key_ops": ["encrypt"] })),
+            secret(&json!({ "alg": "A128KW" })),
+            json!({ "kty": "new", "x": "y" }),
+            secret(&json!({ "kid": "a", "use": "sig", "alg": "HS512" })),
+        ]);
+        let keys = jwks(&others).unwrap();
+        assert_eq!(keys.len(), 1);
+        assert_eq!(keys.candidates(Some("a"), Algorithm::HS512).count(), 1);
+        assert_eq!(keys.candidates(Some("a"), Algorithm::HS256).count(), 0);
+        assert_eq!(keys.candidates(Some("b"), Algorithm::HS512).count(), 0);
+        assert_eq!(jwks(&json!([secret(&json!({ "use": "enc" }))])).unwrap_err(), KeyError::None);
+    }
+
+    #[test]
+    fn a_key_whose_algorithm_is_not_its_own_is_refused() {
+        let refused = jwks(&json!([secret(&json!({ "alg": "RS256" }))])).unwrap_err();
+        assert_eq!(refused, KeyError::Key { number: 1, reason: "its alg is not one of its kty and crv" });
+        let twice = jwks(&json!([secret(&json!({ "kid": "a" })), secret(&json!({ "kid": "a" }))])).unwrap_err();
+        assert_eq!(twice, KeyError::Key { number: 2, reason: "its kid is that of another key" });
+    }
+
+    #[test]
+    fn a_short_rsa_key_is_refused() {
+        let short = KeySet::parse(include_bytes!("../../testdata/tokens/rsa-1024.pem")).unwrap_err();
+        assert_eq!(short, KeyError::Key { number: 1, reason: "it is too short: RSA needs 2048 bits" });
+    }
+
+    #[test]
+    fn a_key_does_not_show_itself_in_a_log() {
+        let keys = jwks(&json!([secret(&json!({ "kid": "name-of-key" }))])).unwrap();
+        let shown = format!("{keys:?}");
+        assert!(shown.contains("HS256") && !shown.contains("0123") && !shown.contains("MDEy"), "{shown}");
+    }
+}

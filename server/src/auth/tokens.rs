@@ -150,3 +150,46 @@ impl Claims {
 fn extent(claim: String) -> Extent {
     if claim == ANY { Extent::Any } else { Extent::Only(claim) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn verifier(keys: &[u8]) -> TokenVerifier {
+        TokenVerifier::new(KeySet::parse(keys).unwrap(), "i", "lanemap")
+    }
+
+    #[test]
+    fn keys_in_pem_verify_what_openssl_signed() {
+        let pairs: [(&[u8], &str); 3] = [
+            (include_bytes!("../../testdata/tokens/rsa.pem"), include_str!("../../testdata/tokens/rsa.jwt")),
+            (include_bytes!("../../testdata/tokens/ed25519.pem"), include_str!("../../testdata/tokens/ed25519.jwt")),
+            (include_bytes!("../../testdata/tokens/p384.pem"), include_str!("../../testdata/tokens/p384.jwt")),
+        ];
+        for (index, (keys, token)) in pairs.iter().enumerate() {
+            let peer = verifier(keys).verify(token).unwrap();
+            assert!(peer.may_read(None).is_ok() && peer.may_stream("north", "car-1").is_err());
+            let another = pairs[(index + 1) % pairs.len()].1;
+            assert_eq!(verifier(keys).verify(another).unwrap_err(), TokenError::NoKey);
+        }
+        let all: Vec<u8> = pairs.iter().flat_map(|(keys, _)| keys.iter().copied()).collect();
+        assert!(pairs.iter().all(|(_, token)| verifier(&all).verify(token).is_ok()));
+    }
+
+    #[test]
+    fn a_scope_is_a_whole_word() {
+        let claims = |scope: &str| Claims {
+            exp: 4_102_444_800,
+            scope: scope.to_owned(),
+            roles: Vec::new(),
+            fleet: None,
+            vehicle: None,
+        };
+        assert!(claims("openid read profile").peer().may_read(None).is_ok());
+        assert!(claims("readers READ read:maps").peer().may_read(None).is_err());
+        assert!(
+            claims("read ingest").peer().may_read(None).is_err(),
+            "one that streams is one fleet's unless it says so"
+        );
+    }
+}

@@ -3,8 +3,14 @@
 //! Each function takes the path of its field, so that an error names it. Whether numbers lie in their ranges is for
 //! `Frame::new` to say; here a message becomes a type or it does not.
 
+mod frame;
+mod sensor;
+
+pub use frame::frame;
+pub use sensor::{PointFrame, sensor};
+
 use lanemap_core::{
-    Category, ControlPoint, EndRule, LaneId, LaneMap, LocalLane, MapLane, TimestampNs,
+    Category, ControlPoint, EndRule, FrameError, LaneId, LaneMap, LocalLane, MapLane, TimestampNs,
     geometry::{Pose, TangentCovariance},
 };
 use nalgebra::{Matrix3, Point3, Quaternion, Translation3, UnitQuaternion};
@@ -64,6 +70,39 @@ pub enum DecodeError {
         /// The number.
         value: i32,
     },
+    /// A value lies outside its range.
+    #[error("{field} is {value}, limit: {limit}")]
+    OutOfRange {
+        /// Path of the field.
+        field: String,
+        /// The value.
+        value: String,
+        /// What it should be.
+        limit: String,
+    },
+    /// A list is longer than allowed.
+    #[error("{field} has {count} entries, at most {limit}")]
+    TooMany {
+        /// Path of the field.
+        field: String,
+        /// Its length.
+        count: usize,
+        /// Greatest length accepted.
+        limit: usize,
+    },
+    /// A list is shorter than needed.
+    #[error("{field} has {count} entries, at least {least}")]
+    TooFew {
+        /// Path of the field.
+        field: String,
+        /// Its length.
+        count: usize,
+        /// Least length accepted.
+        least: usize,
+    },
+    /// The frame is whole but not valid.
+    #[error("frame.{0}")]
+    Frame(#[from] FrameError),
 }
 
 /// The message of a required field.

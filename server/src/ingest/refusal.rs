@@ -112,6 +112,18 @@ impl From<DecodeError> for Refusal {
             DecodeError::NotListed { field, value } => {
                 Self::new(RefusalReason::OutOfRange, field, value, "a number that the protocol lists")
             }
+            DecodeError::OutOfRange { field, value, limit } => {
+                Self::new(RefusalReason::OutOfRange, field, value, limit)
+            }
+            DecodeError::TooMany { field, count, limit } => {
+                let (value, limit) = (format!("{count} entries"), format!("at most {limit}"));
+                Self::new(RefusalReason::TooMany, field, value, limit)
+            }
+            DecodeError::TooFew { field, count, least } => {
+                let (value, limit) = (format!("{count} entries"), format!("at least {least}"));
+                Self::new(RefusalReason::TooFew, field, value, limit)
+            }
+            DecodeError::Frame(error) => Self::from_frame_error(error),
         }
     }
 }

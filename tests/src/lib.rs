@@ -5,6 +5,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::missing_panics_doc)]
 
 pub mod authorities;
+pub mod bags;
 pub mod drives;
 pub mod folders;
 pub mod http;

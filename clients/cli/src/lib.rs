@@ -1,4 +1,4 @@
-//! The `lanemap` command: serve, replay, evaluate, simulate, demo.
+//! The `lanemap` command: serve, replay, record, evaluate, simulate, demo.
 //!
 //! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
 //! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
@@ -9,6 +9,8 @@ use clap::{Parser, Subcommand};
 
 mod demo;
 mod evaluate;
+mod record;
+mod recordings;
 mod replay;
 mod serve;
 mod signal;
@@ -26,8 +28,10 @@ struct Cli {
 enum Command {
     /// Serves vehicles over gRPC and map readers over HTTP.
     Serve(Box<serve::ServeArgs>),
-    /// Replays recorded drives (OpenLane folders) into a server, or into a mapper in this process.
+    /// Replays recorded drives (OpenLane folders, MCAP, ROS 1 bags) into a server, or into a mapper in this process.
     Replay(Box<replay::ReplayArgs>),
+    /// Records drives as MCAP, which Foxglove opens: OpenLane folders, ROS 1 bags, or MCAP again.
+    Record(Box<record::RecordArgs>),
     /// Measures maps, poses and associations as the paper's tables do.
     Evaluate(evaluate::EvaluateArgs),
     /// Serves, with a simulated fleet driving through a town: something to look at.
@@ -44,6 +48,7 @@ pub fn run() -> ExitCode {
     let done = match cli.command {
         Command::Serve(args) => serve::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),

@@ -3,7 +3,7 @@
 //! A mapper runs in this process on the very frames that are streamed. It is deterministic, so that what it makes of
 //! them is what the server makes of them: step times and the local map of every frame come from it, with `--server` too.
 
-mod frames;
+pub mod frames;
 mod mapper_run;
 mod progress;
 mod rate;
@@ -17,8 +17,9 @@ use std::{path::PathBuf, process::ExitCode, time::Instant};
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 use lanemap_core::{Params, Preset};
-use lanemap_openlane::{DriveFolder, Drives};
+use lanemap_recording::RecordedDrive;
 
+use crate::recordings::{DriveArgs, DriveRecorder, RecordingPlace};
 use frames::{Disturbance, Fault, FrameSource, PreparedFrame};
 use mapper_run::MapperRun;
 use progress::Progress;
@@ -30,12 +31,8 @@ use stream::{ServerLink, StreamedDrive};
 /// What to replay, how, and where to.
 #[derive(Args, Debug)]
 pub struct ReplayArgs {
-    /// Folder of drives: segment-*/TIMESTAMP.json beside results/segment-*/TIMESTAMP.json
-    #[arg(long, value_name = "DIR")]
-    drives: PathBuf,
-    /// Only drives whose name contains one of these texts
-    #[arg(long, value_name = "NAME,..", value_delimiter = ',')]
-    only: Vec<String>,
+    #[command(flatten)]
+    recordings: DriveArgs,
     /// The mapper
     #[arg(long, value_enum, default_value_t = PresetArg::Default)]
     preset: PresetArg,
@@ -62,8 +59,11 @@ pub struct ReplayArgs {
     /// mapper in this process that makes it, on the frames that are streamed
     #[arg(long, value_name = "OUT")]
     results_dir: Option<PathBuf>,
+    /// Record what is streamed, noise and all, as MCAP: a file for one drive, a folder for several
+    #[arg(long, value_name = "FILE|DIR")]
+    record: Option<PathBuf>,
     /// Latitude and longitude (degrees) of the origin of the drives' world: poses become GNSS fixes, those of the drive's
-    /// receiver in every frame, or of a drive that has none the first true pose
+    /// receiver in every frame, or of a drive that has none the first true pose; a fix that was recorded stays as it is
     #[arg(long, value_name = "LAT,LON", value_parser = frames::parse_origin, allow_hyphen_values = true)]
     origin: Option<lanemap_core::geometry::georeference::Georeference>,
     /// Print one JSON object on stdout instead of a summary
@@ -94,15 +94,14 @@ impl From<PresetArg> for Preset {
 /// one made here; the rest is replayed.
 #[tokio::main]
 pub async fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
-    let drives = Drives::list(&args.drives, &args.only)
-        .context("no drives to replay; --drives must name a folder of segment-* folders")?;
-    anyhow::ensure!(!drives.is_empty(), "{}: holds no segment-* folder", args.drives.display());
+    let mut drives = args.recordings.open().context("no drives to replay")?;
+    let record = args.record.as_ref().map(|path| RecordingPlace::new(path, "--record", &drives)).transpose()?;
     let server = if args.local { None } else { Some(ServerLink::connect(&args.server).await?) };
-    let progress = Progress::new(drives.iter().map(DriveFolder::len).sum());
+    let progress = Progress::new(drives.iter().map(RecordedDrive::len).sum());
     let started = Instant::now();
     let mut reports = Vec::new();
-    for drive in &drives {
-        reports.push(replay_drive(args, drive, server.as_ref(), &progress).await?);
+    for drive in &mut drives {
+        reports.push(replay_drive(args, drive, server.as_ref(), record.as_ref(), &progress).await?);
     }
     progress.finish();
     let report = ReplayReport::new(reports, started.elapsed());
@@ -116,28 +115,35 @@ pub async fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 
 async fn replay_drive(
     args: &ReplayArgs,
-    drive: &DriveFolder,
+    drive: &mut RecordedDrive,
     server: Option<&ServerLink>,
+    record: Option<&RecordingPlace>,
     progress: &Progress,
 ) -> anyhow::Result<DriveReport> {
+    let name = drive.name().to_owned();
     let disturbance = Disturbance { pose_noise: args.pose_noise, drop: args.drop, seed: args.seed };
     let mut source = FrameSource::new(drive, disturbance, args.origin);
-    let results = args.results_dir.as_ref().map(|root| ResultWriter::new(root, drive.name()));
+    let results = args.results_dir.as_ref().map(|root| ResultWriter::new(root, &name));
+    let mut recorder = record.map(|place| place.recorder(&name, args.preset.into())).transpose()?;
     let mut pacer = Pacer::new(args.rate);
     let mut run: Option<DriveRun<'_>> = None;
     for prepared in source.by_ref() {
         let run = match &mut run {
             Some(run) => run,
-            None => run.insert(DriveRun::start(args.preset, drive.name(), &prepared, server).await?),
+            None => run.insert(DriveRun::start(args.preset, &name, &prepared, server).await?),
         };
         let due = pacer.wait_for(prepared.frame.time()).await;
+        if let Some(recorder) = &mut recorder {
+            recorder.take(&prepared)?;
+        }
         run.take(&prepared, results.as_ref()).await?;
         progress.stepped(run.mapper.lanes(), run.unacked, due.elapsed());
     }
     let faults = source.into_faults();
+    recorder.map(DriveRecorder::finish).transpose()?;
     match run {
-        Some(run) => run.finish(drive.name(), faults).await,
-        None => Ok(DriveReport::new(drive.name(), None, faults, None)),
+        Some(run) => run.finish(&name, faults).await,
+        None => Ok(DriveReport::new(&name, None, faults, None)),
     }
 }
 
@@ -155,7 +161,7 @@ impl<'a> DriveRun<'a> {
         first: &PreparedFrame,
         server: Option<&'a ServerLink>,
     ) -> anyhow::Result<Self> {
-        let sensor = first.annotation.sensor();
+        let sensor = first.camera.sensor;
         let stream = match server {
             Some(link) => Some(link.open(name, preset.into(), sensor).await?),
             None => None,
@@ -164,14 +170,14 @@ impl<'a> DriveRun<'a> {
     }
 
     async fn take(&mut self, prepared: &PreparedFrame, results: Option<&ResultWriter<'_>>) -> anyhow::Result<()> {
-        let PreparedFrame { frame, annotation } = prepared;
+        let PreparedFrame { frame, recorded_pose, camera } = prepared;
         if let Some(stream) = &mut self.stream {
             stream.send(frame).await?;
             self.unacked = stream.unacked_at(frame);
         }
-        self.mapper.step(frame, annotation);
+        self.mapper.step(frame, recorded_pose);
         match results {
-            Some(results) => results.write(frame.time(), annotation, self.mapper.mapper()),
+            Some(results) => results.write(frame.time(), camera, self.mapper.mapper()),
             None => Ok(()),
         }
     }

@@ -1,11 +1,11 @@
 //! Frames of a recorded drive as a vehicle would have streamed them: disturbed as asked for, validated one by one.
 
-use anyhow::Context;
 use lanemap_core::{
-    Frame, FrameLimits, GnssFix, Pose, Sequence, TimestampNs,
+    Frame, FrameError, FrameLimits, GnssFix, Pose,
     geometry::georeference::{Anchor, Georeference, Wgs84},
 };
-use lanemap_openlane::{Annotation, DriveFolder, DriveFrame, noisy_odometry};
+use lanemap_openlane::{noisy_odometry, timestamp_stem};
+use lanemap_recording::{Camera, Frames, RecordedDrive, RecordedFrame};
 use lanemap_simulator::OdometryNoise;
 use rand::Rng;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
@@ -14,7 +14,7 @@ use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 const GNSS_SIGMA_M: f64 = 1.0;
 
 /// What is done to the frames of a drive before they are streamed.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Disturbance {
     /// Noise of the odometry.
     pub pose_noise: OdometryNoise,
@@ -24,19 +24,21 @@ pub struct Disturbance {
     pub seed: u64,
 }
 
-/// A frame ready to be streamed, with the annotation that it came from.
+/// A frame ready to be streamed, with what was recorded beside it.
 #[derive(Debug)]
 pub struct PreparedFrame {
     /// The frame.
     pub frame: Frame,
-    /// The truth about it.
-    pub annotation: Annotation,
+    /// The pose that was recorded, undisturbed.
+    pub recorded_pose: Pose,
+    /// The camera.
+    pub camera: Camera,
 }
 
 /// Why a frame was left out.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Fault {
-    /// File name of the frame, without its ending.
+    /// The frame: the name of its file, without ending, or its place in the recording.
     pub frame: String,
     /// What is wrong, with file or field.
     pub error: String,
@@ -44,8 +46,8 @@ pub struct Fault {
 
 /// Reads the frames of a drive. A frame that cannot be read or is not valid is left out and noted; the rest goes on.
 pub struct FrameSource<'a> {
-    drive: &'a DriveFolder,
-    next: usize,
+    name: String,
+    frames: Frames<'a>,
     disturbance: Disturbance,
     noise_rng: ChaCha8Rng,
     drop_rng: ChaCha8Rng,
@@ -57,23 +59,16 @@ pub struct FrameSource<'a> {
 
 impl<'a> FrameSource<'a> {
     /// The frames of a drive, `world` being where its world lies on the earth.
-    pub fn new(drive: &'a DriveFolder, disturbance: Disturbance, world: Option<Georeference>) -> Self {
+    pub fn new(drive: &'a mut RecordedDrive, disturbance: Disturbance, world: Option<Georeference>) -> Self {
+        let name = drive.name().to_owned();
         let rng = |purpose| {
             let mut rng = ChaCha8Rng::seed_from_u64(disturbance.seed);
-            rng.set_stream(stream_of(drive.name()) ^ purpose);
+            rng.set_stream(stream_of(&name) ^ purpose);
             rng
         };
-        Self {
-            drive,
-            next: 0,
-            disturbance,
-            noise_rng: rng(0),
-            drop_rng: rng(1),
-            last: None,
-            world,
-            has_fix: false,
-            faults: Vec::new(),
-        }
+        let (noise_rng, drop_rng) = (rng(0), rng(1));
+        let frames = drive.frames();
+        Self { name, frames, disturbance, noise_rng, drop_rng, last: None, world, has_fix: false, faults: Vec::new() }
     }
 
     /// What was left out.
@@ -81,20 +76,21 @@ impl<'a> FrameSource<'a> {
         self.faults
     }
 
-    fn prepare(&mut self, time: TimestampNs, sequence: Sequence) -> anyhow::Result<PreparedFrame> {
-        let recorded = self.drive.frame(time)?;
-        let truth = recorded.annotation.pose()?;
-        let covariance = self.disturbance.pose_noise.motion_covariance();
-        let odometry = self.odometry_at(truth);
-        let mut parts = recorded.frame_parts(sequence, odometry, Some(covariance));
+    fn prepare(&mut self, recorded: RecordedFrame) -> Result<PreparedFrame, FrameError> {
+        let RecordedFrame { mut parts, poses_are_true, world_from_vehicle_gnss, camera } = recorded;
+        let recorded_pose = parts.odometry.odometry_from_vehicle;
+        let noise = self.disturbance.pose_noise;
+        parts.odometry.odometry_from_vehicle = self.odometry_at(recorded_pose);
+        if poses_are_true || noise != OdometryNoise::default() {
+            parts.odometry.motion_covariance = Some(noise.motion_covariance());
+        }
         if !parts.detections.is_empty() && self.drop_rng.random::<f64>() < self.disturbance.drop {
             let dropped = self.drop_rng.random_range(0..parts.detections.len());
             parts.detections.remove(dropped);
         }
-        parts.gnss = self.fix_of(&recorded, &truth);
-        let frame = Frame::new(parts, &FrameLimits::default())
-            .with_context(|| format!("{} and its result file", recorded.annotation.path.display()))?;
-        Ok(PreparedFrame { frame, annotation: recorded.annotation })
+        parts.gnss = self.fix_of(parts.gnss, world_from_vehicle_gnss, &recorded_pose);
+        let frame = Frame::new(parts, &FrameLimits::default())?;
+        Ok(PreparedFrame { frame, recorded_pose, camera })
     }
 
     /// The odometry's pose: the last one, moved by the true motion since then and by its noise.
@@ -116,15 +112,24 @@ impl<'a> FrameSource<'a> {
         odometry
     }
 
-    fn fix_of(&mut self, recorded: &DriveFrame, truth: &Pose) -> Option<GnssFix> {
-        let world = self.world.as_ref()?;
-        let pose = match (&recorded.annotation.world_from_vehicle_gnss, self.has_fix) {
-            (Some(gnss), _) => gnss,
-            (None, false) => truth,
-            (None, true) => return None,
-        };
-        self.has_fix = true;
-        Some(world.fix_at(pose, GNSS_SIGMA_M, GNSS_SIGMA_M))
+    /// The fix that was recorded, else the pose that a receiver gave, else, once, the pose itself.
+    fn fix_of(&mut self, fix: Option<GnssFix>, gnss: Option<Pose>, pose: &Pose) -> Option<GnssFix> {
+        let fix = fix.or_else(|| {
+            let world = self.world.as_ref()?;
+            let pose = match (&gnss, self.has_fix) {
+                (Some(gnss), _) => gnss,
+                (None, false) => pose,
+                (None, true) => return None,
+            };
+            Some(world.fix_at(pose, GNSS_SIGMA_M, GNSS_SIGMA_M))
+        });
+        self.has_fix |= fix.is_some();
+        fix
+    }
+
+    fn leave_out(&mut self, frame: String, error: String) {
+        tracing::error!("{}: {frame} left out: {error}", self.name);
+        self.faults.push(Fault { frame, error });
     }
 }
 
@@ -133,15 +138,15 @@ impl Iterator for FrameSource<'_> {
 
     fn next(&mut self) -> Option<PreparedFrame> {
         loop {
-            let time = *self.drive.times().get(self.next)?;
-            self.next += 1;
-            match self.prepare(time, Sequence(self.next as u64)) {
-                Ok(frame) => return Some(frame),
-                Err(error) => {
-                    let error = format!("{error:#}");
-                    tracing::error!("{}: frame left out: {error}", self.drive.name());
-                    self.faults.push(Fault { frame: lanemap_openlane::timestamp_stem(time), error });
+            match self.frames.next()? {
+                Ok(recorded) => {
+                    let stem = timestamp_stem(recorded.parts.time);
+                    match self.prepare(recorded) {
+                        Ok(frame) => return Some(frame),
+                        Err(error) => self.leave_out(stem, error.to_string()),
+                    }
                 }
+                Err(fault) => self.leave_out(fault.frame, fault.error.to_string()),
             }
         }
     }

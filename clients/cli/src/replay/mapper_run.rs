@@ -2,8 +2,7 @@
 
 use std::time::Instant;
 
-use lanemap_core::{Frame, Mapper, Params, Sensor};
-use lanemap_openlane::Annotation;
+use lanemap_core::{Frame, Mapper, Params, Pose, Sensor};
 use nalgebra::Vector3;
 
 use super::step_times::StepTimes;
@@ -28,13 +27,11 @@ impl MapperRun {
         Self { mapper, times: StepTimes::default(), steps: 0, lanes: 0, driven_m: 0.0, last_place: None }
     }
 
-    /// Takes a frame. Only `Mapper::step` itself is timed.
-    pub fn step(&mut self, frame: &Frame, annotation: &Annotation) {
-        if let Some(pose) = annotation.world_from_vehicle {
-            let place = pose.translation.vector;
-            self.driven_m += self.last_place.map_or(0.0, |last| (place - last).norm());
-            self.last_place = Some(place);
-        }
+    /// Takes a frame, which was recorded at `pose`. Only `Mapper::step` itself is timed.
+    pub fn step(&mut self, frame: &Frame, pose: &Pose) {
+        let place = pose.translation.vector;
+        self.driven_m += self.last_place.map_or(0.0, |last| (place - last).norm());
+        self.last_place = Some(place);
         let started = Instant::now();
         let report = self.mapper.step(frame);
         let took = started.elapsed();

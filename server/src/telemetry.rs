@@ -32,6 +32,13 @@ pub const CREDENTIALS_REFUSED: &str = "lanemap_credentials_refused_total";
 /// Poses and local maps dropped because their client did not read them.
 pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 
+/// Streams over zenoh that ended because a message was missing, too large or too many, by gRPC `code`.
+pub const ZENOH_BROKEN: &str = "lanemap_zenoh_streams_broken_total";
+/// Messages over zenoh that came again and were passed over.
+pub const ZENOH_REPEATED: &str = "lanemap_zenoh_messages_repeated_total";
+/// Messages over zenoh that belong to no stream.
+pub const ZENOH_TURNED_AWAY: &str = "lanemap_zenoh_messages_turned_away_total";
+
 /// Buckets of durations, seconds: 10 us to 10 s.
 const SECONDS: [f64; 13] = [1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25, 1.0, 3.0, 10.0];
 
@@ -73,5 +80,8 @@ fn describe() {
     describe_gauge!(CONNECTIONS, Unit::Count, "Connections that are open");
     describe_counter!(HANDSHAKES_FAILED, Unit::Count, "TLS handshakes that failed or took too long");
     describe_counter!(CREDENTIALS_REFUSED, Unit::Count, "Requests whose token or certificate was not taken");
+    describe_counter!(ZENOH_BROKEN, Unit::Count, "Streams over zenoh that a missing or refused message ended, by code");
+    describe_counter!(ZENOH_REPEATED, Unit::Count, "Messages over zenoh that came again");
+    describe_counter!(ZENOH_TURNED_AWAY, Unit::Count, "Messages over zenoh that belong to no stream");
     describe_counter!(UPDATES_DROPPED, Unit::Count, "Poses and local maps that their client did not read in time");
 }

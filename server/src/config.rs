@@ -12,10 +12,8 @@ use thiserror::Error;
 use crate::auth::exposure;
 
 mod overrides;
-mod zenoh;
 
 pub use overrides::ConfigOverrides;
-pub use zenoh::{EndpointError, Endpoints, ModeError, ZenohMode};
 
 /// Every setting of the service.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -50,13 +48,7 @@ pub struct ServerConfig {
     pub anonymous_read: bool,
     /// Folder of the embedded store; created where it does not exist.
     pub data_dir: PathBuf,
-    /// What the server is in zenoh: `off`, a `router` to which vehicles connect, or a `client` of one.
-    pub zenoh_mode: ZenohMode,
-    /// Where a zenoh router listens, e.g. `tcp/0.0.0.0:7447`; several are separated by commas.
-    pub zenoh_listen: Endpoints,
-    /// Zenoh routers to connect to, e.g. `tcp/router:7447`; several are separated by commas. A client needs one.
-    pub zenoh_connect: Endpoints,
-    /// Largest message of a vehicle, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
+    /// Largest gRPC message, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
     pub max_message_bytes: usize,
     /// Most detections in a frame, at least 1.
     pub max_detections: usize,
@@ -84,6 +76,9 @@ pub struct ServerConfig {
     pub unload_after_s: u64,
     /// Time between pings that find dead connections, seconds, at least 1.
     pub keep_alive_s: u64,
+    /// Time between the fall of `/readyz` and the end of streams when the service is told to stop, milliseconds: balancers
+    /// see the one before the other.
+    pub drain_delay_ms: u64,
     /// Time that a shutdown gives open streams and connections to end, seconds.
     pub shutdown_grace_s: u64,
     /// File of the key behind the pseudonyms of vehicles and drives, within the store's folder unless it is absolute.
@@ -109,9 +104,6 @@ impl Default for ServerConfig {
             token_audience: "lanemap".to_owned(),
             anonymous_read: false,
             data_dir: PathBuf::from("lanemap-data"),
-            zenoh_mode: ZenohMode::Off,
-            zenoh_listen: Endpoints::loopback(),
-            zenoh_connect: Endpoints::default(),
             max_message_bytes: 32 * 1024 * 1024,
             max_detections: limits.max_detections,
             max_points_per_detection: limits.max_points_per_detection,
@@ -126,6 +118,7 @@ impl Default for ServerConfig {
             publish_interval_ms: 150,
             unload_after_s: 60,
             keep_alive_s: 20,
+            drain_delay_ms: 0,
             shutdown_grace_s: 6,
             privacy_key_file: PathBuf::from("privacy.key"),
         }
@@ -205,7 +198,6 @@ impl ServerConfig {
             let inside = value >= minimum && value <= maximum;
             if inside { Ok(()) } else { Err(ConfigError::OutOfRange { name, value: value.to_string(), limit }) }
         };
-        self.check_zenoh()?;
         within("max_message_bytes", self.max_message_bytes as f64, 1024.0, 1024.0 * 1024.0 * 1024.0, "1024 ..= 2^30")?;
         within("max_detections", self.max_detections as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_points_per_detection", self.max_points_per_detection as f64, 2.0, 1e7, "2 ..= 1e7")?;
@@ -220,6 +212,7 @@ impl ServerConfig {
         within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;
         within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")?;
         within("tls_handshake_timeout_s", self.tls_handshake_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("max_tls_handshakes", self.max_tls_handshakes as f64, 1.0, 1e6, "1 ..= 1e6")?;
@@ -242,19 +235,6 @@ impl ServerConfig {
         let (keys, issuer) = (self.token_keys_file.is_some(), self.token_issuer.is_some());
         needs("token_keys_file", keys, issuer, "token_issuer")?;
         needs("token_issuer", issuer, keys, "token_keys_file")
-    }
-
-    fn check_zenoh(&self) -> Result<(), ConfigError> {
-        let needed = |name, limit| Err(ConfigError::OutOfRange { name, value: "nothing".to_owned(), limit });
-        match self.zenoh_mode {
-            ZenohMode::Client if self.zenoh_connect.is_empty() => {
-                needed("zenoh_connect", "at least one router, since zenoh_mode is client")
-            }
-            ZenohMode::Router if self.zenoh_listen.is_empty() && self.zenoh_connect.is_empty() => {
-                needed("zenoh_listen", "at least one endpoint, since zenoh_mode is router")
-            }
-            _ => Ok(()),
-        }
     }
 
     /// The bounds on a frame.
@@ -282,6 +262,10 @@ impl ServerConfig {
 
     pub(crate) fn keep_alive(&self) -> Duration {
         Duration::from_secs(self.keep_alive_s)
+    }
+
+    pub(crate) fn drain_delay(&self) -> Duration {
+        Duration::from_millis(self.drain_delay_ms)
     }
 
     pub(crate) fn shutdown_grace(&self) -> Duration {

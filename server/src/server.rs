@@ -20,8 +20,8 @@ use crate::{
         layer::authenticate,
         reload::{CredentialError, Credentials},
     },
-    config::{ConfigError, ServerConfig, ZenohMode},
-    ingest::{IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
+    config::{ConfigError, ServerConfig},
+    ingest::{IngestGrpc, conversation::Conversations},
     journal::{CommitterThread, Journal, JournalError},
     listener,
     map_service::MapGrpc,
@@ -65,9 +65,6 @@ pub enum StartError {
         /// What is wrong with it.
         source: std::io::Error,
     },
-    /// The zenoh side of ingest does not start.
-    #[error(transparent)]
-    Zenoh(#[from] ZenohError),
     /// The descriptors for reflection do not read.
     #[error("gRPC reflection: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
@@ -83,7 +80,7 @@ pub struct RunningServer {
     address: SocketAddr,
     sessions: Sessions,
     credentials: Credentials,
-    shutdown: CancellationToken,
+    stop: CancellationToken,
     task: JoinHandle<()>,
 }
 
@@ -101,7 +98,7 @@ impl Server {
         let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
         let (journal, committer) = Journal::open(&config.data_dir, config.max_frames_per_commit).map_err(in_store)?;
         let pseudonyms = pseudonyms(&config, &journal)?;
-        let (sessions, shutdown) = (Sessions::default(), CancellationToken::new());
+        let (sessions, stop, shutdown) = (Sessions::default(), CancellationToken::new(), CancellationToken::new());
         let journal_failed = journal.failed();
         let surroundings = Surroundings {
             config: Arc::clone(&config),
@@ -121,30 +118,25 @@ impl Server {
         let streams = TaskTracker::new();
         let conversations =
             Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
-        let (health, router) = router(&config, IngestGrpc::new(conversations.clone()), http).await?;
+        let (health, router) = router(&config, IngestGrpc::new(conversations), http).await?;
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
-        let zenoh = match config.zenoh_mode {
-            ZenohMode::Off => None,
-            ZenohMode::Router | ZenohMode::Client => {
-                Some(ZenohIngest::open(&config, conversations, streams.clone()).await?)
-            }
-        };
 
         let running = Running {
             config,
             credentials: credentials.clone(),
             registry,
             streams,
-            zenoh,
             ready,
             health,
-            shutdown: shutdown.clone(),
+            stop: stop.clone(),
+            shutdown,
             journal_failed,
             committer,
         };
+        metrics::gauge!(telemetry::READY).set(1.0);
         let task = tokio::spawn(running.run(listener, router));
         tracing::info!(%address, "serving gRPC and HTTP");
-        Ok(RunningServer { address, sessions, credentials, shutdown, task })
+        Ok(RunningServer { address, sessions, credentials, stop, task })
     }
 }
 
@@ -177,12 +169,13 @@ impl RunningServer {
     /// Begins a shutdown when cancelled; e.g. from a signal handler.
     #[must_use]
     pub fn shutdown_token(&self) -> CancellationToken {
-        self.shutdown.clone()
+        self.stop.clone()
     }
 
-    /// Stops: readiness falls, streams end with what they were promised, drives are saved, the port and the store close.
+    /// Stops: readiness falls, then, `drain_delay_ms` later, streams end with what they were promised, drives are saved,
+    /// the port and the store close.
     pub async fn shutdown(self) {
-        self.shutdown.cancel();
+        self.stop.cancel();
         self.stopped().await;
     }
 
@@ -196,7 +189,7 @@ impl RunningServer {
 
 impl Drop for RunningServer {
     fn drop(&mut self) {
-        self.shutdown.cancel();
+        self.stop.cancel();
     }
 }
 
@@ -206,9 +199,11 @@ struct Running {
     credentials: Credentials,
     registry: SessionRegistry,
     streams: TaskTracker,
-    zenoh: Option<ZenohIngest>,
     ready: watch::Sender<bool>,
     health: HealthReporter,
+    /// The service is told to stop: readiness falls.
+    stop: CancellationToken,
+    /// The drain begins: streams and sessions end.
     shutdown: CancellationToken,
     journal_failed: CancellationToken,
     committer: CommitterThread,
@@ -219,6 +214,24 @@ impl Running {
         self.ready.send_replace(false);
         self.health.set_service_status("", ServingStatus::NotServing).await;
         self.health.set_not_serving::<IngestServiceServer<IngestGrpc>>().await;
+        metrics::gauge!(telemetry::READY).set(0.0);
+    }
+
+    /// Waits for the word to stop; readiness falls at once, the drain begins once balancers have had time to see it.
+    async fn stopped(&self) {
+        tokio::select! {
+            () = self.stop.cancelled() => {}
+            () = self.journal_failed.cancelled() => {
+                self.turn_unready().await;
+                // Maps stay readable; whoever watches readiness restarts the service, which opens the store anew.
+                self.stop.cancelled().await;
+            }
+        }
+        tracing::info!("shutting down");
+        self.turn_unready().await;
+        self.health.set_not_serving::<MapServiceServer<MapGrpc>>().await;
+        sleep(self.config.drain_delay()).await;
+        self.shutdown.cancel();
     }
 
     async fn run(self, listener: TcpListener, router: Router) {
@@ -242,17 +255,7 @@ impl Running {
                 telemetry::metrics_handle().run_upkeep();
             }
         });
-        tokio::select! {
-            () = self.shutdown.cancelled() => {}
-            () = self.journal_failed.cancelled() => {
-                self.turn_unready().await;
-                // Maps stay readable; whoever watches readiness restarts the service, which opens the store anew.
-                self.shutdown.cancelled().await;
-            }
-        }
-
-        tracing::info!("shutting down");
-        self.turn_unready().await;
+        self.stopped().await;
         self.streams.close();
         let sessions_left = async {
             self.streams.wait().await;
@@ -260,9 +263,6 @@ impl Running {
         };
         if timeout(grace, sessions_left).await.is_err() {
             tracing::warn!("some sessions had not left at the end of the grace time; what they acked is durable");
-        }
-        if let Some(zenoh) = self.zenoh {
-            zenoh.close().await;
         }
         stop_listening.cancel();
         if let Err(error) = serving.await {
@@ -319,5 +319,5 @@ async fn router(
         .add_service(maps)
         .add_service(health)
         .add_service(reflection);
-    Ok((reporter, routes.into_axum_router()))
+    Ok((reporter, routes.into_axum_router().layer(middleware::from_fn(telemetry::requests::observe))))
 }

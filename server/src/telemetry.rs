@@ -1,7 +1,12 @@
-//! Metrics: names in base units, counters end in `_total`, and no label names a vehicle.
+//! Metrics: names in base units, counters end in `_total`, and no label names a vehicle or a session.
+
+pub mod requests;
+#[cfg(feature = "otlp")]
+pub mod traces;
 
 use std::sync::OnceLock;
 
+use lanemap_proto::v1::RefusalReason;
 use metrics::{Unit, describe_counter, describe_gauge, describe_histogram};
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 
@@ -32,12 +37,14 @@ pub const CREDENTIALS_REFUSED: &str = "lanemap_credentials_refused_total";
 /// Poses and local maps dropped because their client did not read them.
 pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 
-/// Streams over zenoh that ended because a message was missing, too large or too many, by gRPC `code`.
-pub const ZENOH_BROKEN: &str = "lanemap_zenoh_streams_broken_total";
-/// Messages over zenoh that came again and were passed over.
-pub const ZENOH_REPEATED: &str = "lanemap_zenoh_messages_repeated_total";
-/// Messages over zenoh that belong to no stream.
-pub const ZENOH_TURNED_AWAY: &str = "lanemap_zenoh_messages_turned_away_total";
+/// HTTP requests and gRPC calls, by `method`, `route` and `status`.
+pub const REQUESTS: &str = "lanemap_http_requests_total";
+/// Seconds from a request to the head of its answer, by `method` and `route`.
+pub const REQUEST_SECONDS: &str = "lanemap_http_request_seconds";
+/// 1 while the service takes traffic, 0 from the moment it begins to stop.
+pub const READY: &str = "lanemap_ready";
+/// Always 1, with the `version`.
+pub const BUILD_INFO: &str = "lanemap_build_info";
 
 /// Buckets of durations, seconds: 10 us to 10 s.
 const SECONDS: [f64; 13] = [1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25, 1.0, 3.0, 10.0];
@@ -64,7 +71,30 @@ fn install() -> PrometheusHandle {
         tracing::warn!("another metrics recorder is installed: /metrics stays empty");
     }
     describe();
+    metrics_process::Collector::default().describe();
+    begin_at_zero();
+    metrics::gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
     handle
+}
+
+/// The Prometheus text format: the service's metrics, and the process's as they are now.
+#[must_use]
+pub fn render(handle: &PrometheusHandle) -> String {
+    metrics_process::Collector::default().collect();
+    handle.render()
+}
+
+/// Counters that nothing has counted yet are shown as 0, so that their first increase is seen as one.
+fn begin_at_zero() {
+    for name in [FRAMES_ACKED, FRAMES_REPEATED, UPDATES_DROPPED, HANDSHAKES_FAILED, CREDENTIALS_REFUSED] {
+        metrics::counter!(name).increment(0);
+    }
+    for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
+        metrics::counter!(REFUSALS, "reason" => reason.as_str_name()).increment(0);
+    }
+    for name in [SESSIONS_LIVE, CONNECTIONS] {
+        metrics::gauge!(name).increment(0.0);
+    }
 }
 
 fn describe() {
@@ -80,8 +110,9 @@ fn describe() {
     describe_gauge!(CONNECTIONS, Unit::Count, "Connections that are open");
     describe_counter!(HANDSHAKES_FAILED, Unit::Count, "TLS handshakes that failed or took too long");
     describe_counter!(CREDENTIALS_REFUSED, Unit::Count, "Requests whose token or certificate was not taken");
-    describe_counter!(ZENOH_BROKEN, Unit::Count, "Streams over zenoh that a missing or refused message ended, by code");
-    describe_counter!(ZENOH_REPEATED, Unit::Count, "Messages over zenoh that came again");
-    describe_counter!(ZENOH_TURNED_AWAY, Unit::Count, "Messages over zenoh that belong to no stream");
+    describe_counter!(REQUESTS, Unit::Count, "HTTP requests and gRPC calls, by method, route and status");
+    describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "From a request to the head of its answer");
+    describe_gauge!(READY, Unit::Count, "1 while the service takes traffic, 0 from the moment it begins to stop");
+    describe_gauge!(BUILD_INFO, Unit::Count, "Always 1, with the version of the service");
     describe_counter!(UPDATES_DROPPED, Unit::Count, "Poses and local maps that their client did not read in time");
 }

@@ -1,14 +1,16 @@
-//! The `lanemap` command: serve, replay, record, evaluate, simulate, demo.
+//! The `lanemap` command: serve, replay, record, evaluate, bench, simulate, demo.
 //!
 //! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
 //! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
 
-use std::{io::IsTerminal, process::ExitCode};
+use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+mod bench;
 mod demo;
 mod evaluate;
+mod logging;
 mod record;
 mod recordings;
 mod replay;
@@ -36,6 +38,8 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     /// Serves, with a simulated fleet driving through a town: something to look at.
     Demo(demo::DemoArgs),
+    /// Measures what a server bears: a load of many vehicles, and what the transport alone costs.
+    Bench(bench::BenchArgs),
     /// Makes synthetic drives with their truth, as OpenLane folders.
     Simulate(simulate::SimulateArgs),
 }
@@ -44,12 +48,15 @@ enum Command {
 #[must_use]
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
-    log_to_stderr();
+    if !matches!(cli.command, Command::Serve(_)) {
+        logging::to_stderr();
+    }
     let done = match cli.command {
         Command::Serve(args) => serve::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Bench(args) => bench::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };
@@ -60,15 +67,4 @@ pub fn run() -> ExitCode {
             ExitCode::FAILURE
         }
     }
-}
-
-/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business.
-const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn";
-
-/// Logs to stderr, in colour where that is a terminal.
-fn log_to_stderr() {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(DEFAULT_LOG));
-    let colour = std::io::stderr().is_terminal();
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colour).with_writer(std::io::stderr).init();
 }

@@ -3,6 +3,10 @@
 
 use std::process::ExitCode;
 
+/// Frames are many small allocations, made on one thread and freed on another.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> ExitCode {
     lanemap_cli::run()
 }

@@ -4,12 +4,9 @@ use std::{net::SocketAddr, path::PathBuf, process::ExitCode};
 
 use anyhow::Context;
 use clap::Args;
-use lanemap_server::{
-    ConfigOverrides, Server, ServerConfig,
-    config::{Endpoints, ZenohMode},
-};
+use lanemap_server::{ConfigOverrides, Server, ServerConfig};
 
-use crate::signal;
+use crate::{logging, signal};
 
 /// Settings of the service: a flag wins over its LANEMAP_ variable, that over the file of --config, that over the
 /// default.
@@ -19,6 +16,8 @@ pub struct ServeArgs {
     /// YAML file of settings, named as the flags are, with _ for -; a name that is no setting is refused
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    #[command(flatten)]
+    logs: logging::LogArgs,
     /// Address and port for gRPC and HTTP; port 0 takes any free one [env: LANEMAP_LISTEN] [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDRESS")]
     listen: Option<SocketAddr>,
@@ -67,19 +66,7 @@ pub struct ServeArgs {
     /// Folder of the embedded store; made where it does not exist [env: LANEMAP_DATA_DIR] [default: lanemap-data]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
-    /// What the server is in zenoh: off, a router to which vehicles connect, or a client of one
-    /// [env: LANEMAP_ZENOH_MODE] [default: off]
-    #[arg(long, value_name = "MODE")]
-    zenoh_mode: Option<ZenohMode>,
-    /// Where a zenoh router listens; several are separated by commas
-    /// [env: LANEMAP_ZENOH_LISTEN] [default: tcp/127.0.0.1:7447]
-    #[arg(long, value_name = "ENDPOINTS")]
-    zenoh_listen: Option<Endpoints>,
-    /// Zenoh routers to connect to; several are separated by commas; a client needs one
-    /// [env: LANEMAP_ZENOH_CONNECT] [default: ]
-    #[arg(long, value_name = "ENDPOINTS")]
-    zenoh_connect: Option<Endpoints>,
-    /// Largest message of a vehicle, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
+    /// Largest gRPC message, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
     #[arg(long, value_name = "BYTES")]
     max_message_bytes: Option<usize>,
     /// Most detections in a frame [env: LANEMAP_MAX_DETECTIONS] [default: 64]
@@ -126,6 +113,10 @@ pub struct ServeArgs {
     /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]
     #[arg(long, value_name = "S")]
     keep_alive_s: Option<u64>,
+    /// Time between the fall of /readyz and the end of streams when the service is told to stop, milliseconds
+    /// [env: LANEMAP_DRAIN_DELAY_MS] [default: 0]
+    #[arg(long, value_name = "MS")]
+    drain_delay_ms: Option<u64>,
     /// Time that a shutdown gives open streams and connections to end, seconds
     /// [env: LANEMAP_SHUTDOWN_GRACE_S] [default: 6]
     #[arg(long, value_name = "S")]
@@ -153,9 +144,6 @@ impl ServeArgs {
             token_audience: self.token_audience.clone(),
             anonymous_read: self.anonymous_read,
             data_dir: self.data_dir.clone(),
-            zenoh_mode: self.zenoh_mode,
-            zenoh_listen: self.zenoh_listen.clone(),
-            zenoh_connect: self.zenoh_connect.clone(),
             max_message_bytes: self.max_message_bytes,
             max_detections: self.max_detections,
             max_points_per_detection: self.max_points_per_detection,
@@ -170,6 +158,7 @@ impl ServeArgs {
             publish_interval_ms: self.publish_interval_ms,
             unload_after_s: self.unload_after_s,
             keep_alive_s: self.keep_alive_s,
+            drain_delay_ms: self.drain_delay_ms,
             shutdown_grace_s: self.shutdown_grace_s,
             privacy_key_file: self.privacy_key_file.clone(),
         }
@@ -179,6 +168,7 @@ impl ServeArgs {
 /// Serves until SIGINT or SIGTERM; SIGHUP reads certificates and keys anew.
 #[tokio::main]
 pub async fn run(args: &ServeArgs) -> anyhow::Result<ExitCode> {
+    let _telemetry = logging::start(&args.logs)?;
     let settings = ServerConfig::load(args.config.as_deref(), args.overrides())
         .context("the settings cannot be used; lanemap serve --help lists them all")?;
     let stop = signal::stop_signals()?;

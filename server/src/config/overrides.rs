@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, path::PathBuf};
 
-use super::{Endpoints, ServerConfig, ZenohMode};
+use super::ServerConfig;
 
 /// The settings of [`ServerConfig`], each of which may be unset.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,12 +35,6 @@ pub struct ConfigOverrides {
     pub anonymous_read: Option<bool>,
     /// See [`ServerConfig::data_dir`].
     pub data_dir: Option<PathBuf>,
-    /// See [`ServerConfig::zenoh_mode`].
-    pub zenoh_mode: Option<ZenohMode>,
-    /// See [`ServerConfig::zenoh_listen`].
-    pub zenoh_listen: Option<Endpoints>,
-    /// See [`ServerConfig::zenoh_connect`].
-    pub zenoh_connect: Option<Endpoints>,
     /// See [`ServerConfig::max_message_bytes`].
     pub max_message_bytes: Option<usize>,
     /// See [`ServerConfig::max_detections`].
@@ -69,6 +63,8 @@ pub struct ConfigOverrides {
     pub unload_after_s: Option<u64>,
     /// See [`ServerConfig::keep_alive_s`].
     pub keep_alive_s: Option<u64>,
+    /// See [`ServerConfig::drain_delay_ms`].
+    pub drain_delay_ms: Option<u64>,
     /// See [`ServerConfig::shutdown_grace_s`].
     pub shutdown_grace_s: Option<u64>,
     /// See [`ServerConfig::privacy_key_file`].
@@ -91,9 +87,6 @@ impl ConfigOverrides {
         set(&mut settings.token_audience, self.token_audience);
         set(&mut settings.anonymous_read, self.anonymous_read);
         set(&mut settings.data_dir, self.data_dir);
-        set(&mut settings.zenoh_mode, self.zenoh_mode);
-        set(&mut settings.zenoh_listen, self.zenoh_listen);
-        set(&mut settings.zenoh_connect, self.zenoh_connect);
         set(&mut settings.max_message_bytes, self.max_message_bytes);
         set(&mut settings.max_detections, self.max_detections);
         set(&mut settings.max_points_per_detection, self.max_points_per_detection);
@@ -108,6 +101,7 @@ impl ConfigOverrides {
         set(&mut settings.publish_interval_ms, self.publish_interval_ms);
         set(&mut settings.unload_after_s, self.unload_after_s);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
+        set(&mut settings.drain_delay_ms, self.drain_delay_ms);
         set(&mut settings.shutdown_grace_s, self.shutdown_grace_s);
         set(&mut settings.privacy_key_file, self.privacy_key_file);
     }

@@ -7,6 +7,7 @@ use axum::{
 };
 
 use super::ServeState;
+use crate::telemetry;
 
 /// `GET /healthz`: the process answers.
 pub(super) async fn healthz() -> impl IntoResponse {
@@ -27,5 +28,5 @@ pub(super) async fn readyz(State(state): State<ServeState>) -> impl IntoResponse
 pub(super) async fn metrics(State(state): State<ServeState>) -> impl IntoResponse {
     let headers =
         [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8"), (header::CACHE_CONTROL, "no-store")];
-    (headers, state.metrics.render())
+    (headers, telemetry::render(&state.metrics))
 }

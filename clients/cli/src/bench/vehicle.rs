@@ -1,0 +1,184 @@
+//! A vehicle of the load: it streams one drive after the other until its time is up.
+
+use std::sync::Arc;
+
+use tokio::{
+    sync::watch,
+    task::JoinSet,
+    time::{Duration, Instant, sleep, timeout_at},
+};
+use tonic::{Code, Status};
+
+use super::{
+    answer::Answer,
+    flow::{Flow, Framing, Leg, Pace, Sent, flow},
+    grpc::Connections,
+    rate::FrameRate,
+    tally::Tally,
+    tape::{DriveName, Tape},
+};
+
+/// Time that acks get after the last frame; what is not acked by then is lost.
+pub const ACK_GRACE: Duration = Duration::from_secs(10);
+/// How long a vehicle tries to open a drive that the server has no room for, and the pause between two tries.
+const OPEN_TRIES: u32 = 50;
+const OPEN_PAUSE: Duration = Duration::from_millis(200);
+
+/// What all vehicles of a run share.
+#[derive(Debug)]
+pub struct Fleet {
+    /// Name of the fleet, new in every run, so that every drive is.
+    pub name: String,
+    pub tapes: Vec<Arc<Tape>>,
+    pub vehicles: u32,
+    pub rate: FrameRate,
+    pub window: usize,
+    pub link: Link,
+    pub tally: Tally,
+    /// When the frames begin and end, once every vehicle has opened its first drive.
+    pub run: watch::Receiver<Option<(Instant, Instant)>>,
+}
+
+/// Where the frames go.
+#[derive(Debug)]
+pub enum Link {
+    /// The ingest service over gRPC.
+    Grpc(Connections),
+    /// A gRPC service that sends back what it gets.
+    Echo(Connections),
+}
+
+/// A drive that is open.
+struct OpenDrive {
+    flow: Flow,
+    reading: tokio::task::JoinHandle<()>,
+}
+
+impl Fleet {
+    /// Streams as one vehicle; `ready` hears when its first drive is open.
+    pub async fn drive(self: Arc<Self>, vehicle: u32, ready: tokio::sync::mpsc::Sender<()>) -> anyhow::Result<()> {
+        let mut drives = JoinSet::new();
+        let mut leg = self.first_leg(vehicle);
+        let mut number = 0;
+        let mut open = self.open_patiently(vehicle, number, leg.clone()).await?;
+        ready.send(()).await?;
+        drop(ready);
+        let (began, stop_at) = self.began().await?;
+        let mut pace = Pace { rate: self.rate, next_due: began + self.phase(vehicle), stop_at };
+        loop {
+            open.flow.go(pace);
+            let sent = open.flow.sent().await;
+            drives.spawn(leave(open, stop_at + ACK_GRACE));
+            match sent {
+                Some(Sent::TimeIsUp) => break,
+                Some(Sent::WholeDrive(later)) => pace = later,
+                // The stream broke: frames that were due meanwhile go with the next drive.
+                None => {
+                    if Instant::now() >= stop_at {
+                        break;
+                    }
+                }
+            }
+            number += 1;
+            leg = Leg { from: 0, ..leg };
+            open = self.open_patiently(vehicle, number, leg.clone()).await?;
+        }
+        drives.join_all().await;
+        Ok(())
+    }
+
+    /// Vehicles begin at places of their own, so that their drives do not all end at once.
+    fn first_leg(&self, vehicle: u32) -> Leg {
+        let tape = Arc::clone(&self.tapes[vehicle as usize % self.tapes.len()]);
+        let from = tape.len() * vehicle as usize / self.vehicles as usize;
+        Leg { tape, from, framing: None }
+    }
+
+    /// Frames of different vehicles are due at different moments of a period.
+    fn phase(&self, vehicle: u32) -> Duration {
+        match self.rate {
+            FrameRate::Max => Duration::ZERO,
+            FrameRate::Every(period) => period * vehicle / self.vehicles,
+        }
+    }
+
+    async fn began(&self) -> anyhow::Result<(Instant, Instant)> {
+        let mut run = self.run.clone();
+        let run = run.wait_for(Option::is_some).await?;
+        run.ok_or_else(|| anyhow::anyhow!("the run was given up"))
+    }
+
+    async fn open_patiently(&self, vehicle: u32, number: u32, leg: Leg) -> anyhow::Result<OpenDrive> {
+        for _ in 1..OPEN_TRIES {
+            match self.open(vehicle, number, leg.clone()).await {
+                Ok(open) => return Ok(open),
+                Err(status) if matches!(status.code(), Code::Unavailable | Code::ResourceExhausted) => {
+                    tracing::debug!(vehicle, %status, "no drive could be opened, trying again");
+                    sleep(OPEN_PAUSE).await;
+                }
+                Err(status) => anyhow::bail!("vehicle {vehicle} cannot open a drive: {status}"),
+            }
+        }
+        self.open(vehicle, number, leg)
+            .await
+            .map_err(|status| anyhow::anyhow!("vehicle {vehicle} cannot open a drive: {status}"))
+    }
+
+    async fn open(&self, vehicle: u32, number: u32, mut leg: Leg) -> Result<OpenDrive, Status> {
+        let (connections, is_echo) = match &self.link {
+            Link::Grpc(connections) => (connections, false),
+            Link::Echo(connections) => (connections, true),
+        };
+        if !is_echo {
+            let name = DriveName { fleet: &self.name, vehicle, drive: number };
+            leg.framing = Some(Framing { start: leg.tape.start(name), end: Tape::end() });
+        }
+        let (flow, outgoing) = flow(leg, self.window, &self.tally);
+        let mut answers = connections.stream(vehicle, outgoing).await?;
+        let (reader, tally) = (flow.clone(), self.tally.clone());
+        let (refuse, mut refused) = tokio::sync::oneshot::channel();
+        let reading = tokio::spawn(async move {
+            let ended = loop {
+                match answers.message().await {
+                    Ok(Some(_)) if is_echo => reader.take_echo(),
+                    Ok(Some(bytes)) => match Answer::parse(bytes) {
+                        Ok(answer) => reader.take(answer),
+                        Err(error) => break Err(Status::internal(error.to_string())),
+                    },
+                    Ok(None) => break Ok(()),
+                    Err(status) => break Err(status),
+                }
+            };
+            reader.close();
+            if let Err(status) = ended {
+                // Nobody waits for it once the drive is open.
+                if let Err(status) = refuse.send(status) {
+                    let mut counts = tally.counts();
+                    counts.broken += 1;
+                    counts.complain(|| format!("a stream broke: {status}"));
+                }
+            }
+        });
+        if flow.accepted().await {
+            refused.close();
+            self.tally.counts().drives += 1;
+            return Ok(OpenDrive { flow, reading });
+        }
+        let _ = reading.await;
+        Err(refused.try_recv().unwrap_or_else(|_| Status::unavailable("the stream ended before the drive was open")))
+    }
+}
+
+/// Waits for the acks of a drive that is sent, as long as they may take, then for the end of its stream.
+async fn leave(open: OpenDrive, until: Instant) {
+    let OpenDrive { flow, reading } = open;
+    let abort = reading.abort_handle();
+    let left = async {
+        flow.settled().await;
+        // A panic of the reading task has been reported.
+        let _ = reading.await;
+    };
+    if timeout_at(until, left).await.is_err() {
+        abort.abort();
+    }
+}

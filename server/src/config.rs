@@ -12,8 +12,10 @@ use thiserror::Error;
 use crate::auth::exposure;
 
 mod overrides;
+mod zenoh;
 
 pub use overrides::ConfigOverrides;
+pub use zenoh::{EndpointError, Endpoints, ModeError, ZenohMode};
 
 /// Every setting of the service.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -48,7 +50,13 @@ pub struct ServerConfig {
     pub anonymous_read: bool,
     /// Folder of the embedded store; created where it does not exist.
     pub data_dir: PathBuf,
-    /// Largest gRPC message, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
+    /// What the server is in zenoh: `off`, a `router` to which vehicles connect, or a `client` of one.
+    pub zenoh_mode: ZenohMode,
+    /// Where a zenoh router listens, e.g. `tcp/0.0.0.0:7447`; several are separated by commas.
+    pub zenoh_listen: Endpoints,
+    /// Zenoh routers to connect to, e.g. `tcp/router:7447`; several are separated by commas. A client needs one.
+    pub zenoh_connect: Endpoints,
+    /// Largest message of a vehicle, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
     pub max_message_bytes: usize,
     /// Most detections in a frame, at least 1.
     pub max_detections: usize,
@@ -104,6 +112,9 @@ impl Default for ServerConfig {
             token_audience: "lanemap".to_owned(),
             anonymous_read: false,
             data_dir: PathBuf::from("lanemap-data"),
+            zenoh_mode: ZenohMode::Off,
+            zenoh_listen: Endpoints::loopback(),
+            zenoh_connect: Endpoints::default(),
             max_message_bytes: 32 * 1024 * 1024,
             max_detections: limits.max_detections,
             max_points_per_detection: limits.max_points_per_detection,
@@ -198,6 +209,7 @@ impl ServerConfig {
             let inside = value >= minimum && value <= maximum;
             if inside { Ok(()) } else { Err(ConfigError::OutOfRange { name, value: value.to_string(), limit }) }
         };
+        self.check_zenoh()?;
         within("max_message_bytes", self.max_message_bytes as f64, 1024.0, 1024.0 * 1024.0 * 1024.0, "1024 ..= 2^30")?;
         within("max_detections", self.max_detections as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_points_per_detection", self.max_points_per_detection as f64, 2.0, 1e7, "2 ..= 1e7")?;
@@ -235,6 +247,19 @@ impl ServerConfig {
         let (keys, issuer) = (self.token_keys_file.is_some(), self.token_issuer.is_some());
         needs("token_keys_file", keys, issuer, "token_issuer")?;
         needs("token_issuer", issuer, keys, "token_keys_file")
+    }
+
+    fn check_zenoh(&self) -> Result<(), ConfigError> {
+        let needed = |name, limit| Err(ConfigError::OutOfRange { name, value: "nothing".to_owned(), limit });
+        match self.zenoh_mode {
+            ZenohMode::Client if self.zenoh_connect.is_empty() => {
+                needed("zenoh_connect", "at least one router, since zenoh_mode is client")
+            }
+            ZenohMode::Router if self.zenoh_listen.is_empty() && self.zenoh_connect.is_empty() => {
+                needed("zenoh_listen", "at least one endpoint, since zenoh_mode is router")
+            }
+            _ => Ok(()),
+        }
     }
 
     /// The bounds on a frame.

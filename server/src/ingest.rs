@@ -8,7 +8,9 @@ mod grpc;
 mod outbox;
 mod refusal;
 mod upload;
+pub(crate) mod zenoh;
 
 pub use grpc::IngestGrpc;
 pub use outbox::{Outbox, OutboxStream};
 pub use refusal::Refusal;
+pub use zenoh::ZenohError;

@@ -20,8 +20,8 @@ use crate::{
         layer::authenticate,
         reload::{CredentialError, Credentials},
     },
-    config::{ConfigError, ServerConfig},
-    ingest::{IngestGrpc, conversation::Conversations},
+    config::{ConfigError, ServerConfig, ZenohMode},
+    ingest::{IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
     journal::{CommitterThread, Journal, JournalError},
     listener,
     map_service::MapGrpc,
@@ -65,6 +65,9 @@ pub enum StartError {
         /// What is wrong with it.
         source: std::io::Error,
     },
+    /// The zenoh side of ingest does not start.
+    #[error(transparent)]
+    Zenoh(#[from] ZenohError),
     /// The descriptors for reflection do not read.
     #[error("gRPC reflection: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
@@ -118,14 +121,21 @@ impl Server {
         let streams = TaskTracker::new();
         let conversations =
             Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
-        let (health, router) = router(&config, IngestGrpc::new(conversations), http).await?;
+        let (health, router) = router(&config, IngestGrpc::new(conversations.clone()), http).await?;
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
+        let zenoh = match config.zenoh_mode {
+            ZenohMode::Off => None,
+            ZenohMode::Router | ZenohMode::Client => {
+                Some(ZenohIngest::open(&config, conversations, streams.clone()).await?)
+            }
+        };
 
         let running = Running {
             config,
             credentials: credentials.clone(),
             registry,
             streams,
+            zenoh,
             ready,
             health,
             stop: stop.clone(),
@@ -199,6 +209,7 @@ struct Running {
     credentials: Credentials,
     registry: SessionRegistry,
     streams: TaskTracker,
+    zenoh: Option<ZenohIngest>,
     ready: watch::Sender<bool>,
     health: HealthReporter,
     /// The service is told to stop: readiness falls.
@@ -263,6 +274,9 @@ impl Running {
         };
         if timeout(grace, sessions_left).await.is_err() {
             tracing::warn!("some sessions had not left at the end of the grace time; what they acked is durable");
+        }
+        if let Some(zenoh) = self.zenoh {
+            zenoh.close().await;
         }
         stop_listening.cancel();
         if let Err(error) = serving.await {

@@ -37,6 +37,12 @@ pub const CREDENTIALS_REFUSED: &str = "lanemap_credentials_refused_total";
 /// Poses and local maps dropped because their client did not read them.
 pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 
+/// Streams over zenoh that ended because a message was missing, too large or too many, by gRPC `code`.
+pub const ZENOH_BROKEN: &str = "lanemap_zenoh_streams_broken_total";
+/// Messages over zenoh that came again and were passed over.
+pub const ZENOH_REPEATED: &str = "lanemap_zenoh_messages_repeated_total";
+/// Messages over zenoh that belong to no stream.
+pub const ZENOH_TURNED_AWAY: &str = "lanemap_zenoh_messages_turned_away_total";
 /// HTTP requests and gRPC calls, by `method`, `route` and `status`.
 pub const REQUESTS: &str = "lanemap_http_requests_total";
 /// Seconds from a request to the head of its answer, by `method` and `route`.
@@ -110,6 +116,9 @@ fn describe() {
     describe_gauge!(CONNECTIONS, Unit::Count, "Connections that are open");
     describe_counter!(HANDSHAKES_FAILED, Unit::Count, "TLS handshakes that failed or took too long");
     describe_counter!(CREDENTIALS_REFUSED, Unit::Count, "Requests whose token or certificate was not taken");
+    describe_counter!(ZENOH_BROKEN, Unit::Count, "Streams over zenoh that a missing or refused message ended, by code");
+    describe_counter!(ZENOH_REPEATED, Unit::Count, "Messages over zenoh that came again");
+    describe_counter!(ZENOH_TURNED_AWAY, Unit::Count, "Messages over zenoh that belong to no stream");
     describe_counter!(REQUESTS, Unit::Count, "HTTP requests and gRPC calls, by method, route and status");
     describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "From a request to the head of its answer");
     describe_gauge!(READY, Unit::Count, "1 while the service takes traffic, 0 from the moment it begins to stop");

@@ -10,6 +10,7 @@ pub mod drives;
 pub mod folders;
 pub mod http;
 pub mod raw_stream;
+pub mod raw_zenoh;
 pub mod servers;
 pub mod simulated;
 pub mod tokens;

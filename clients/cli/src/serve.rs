@@ -4,7 +4,10 @@ use std::{net::SocketAddr, path::PathBuf, process::ExitCode};
 
 use anyhow::Context;
 use clap::Args;
-use lanemap_server::{ConfigOverrides, Server, ServerConfig};
+use lanemap_server::{
+    ConfigOverrides, Server, ServerConfig,
+    config::{Endpoints, ZenohMode},
+};
 
 use crate::{logging, signal};
 
@@ -66,7 +69,19 @@ pub struct ServeArgs {
     /// Folder of the embedded store; made where it does not exist [env: LANEMAP_DATA_DIR] [default: lanemap-data]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
-    /// Largest gRPC message, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
+    /// What the server is in zenoh: off, a router to which vehicles connect, or a client of one
+    /// [env: LANEMAP_ZENOH_MODE] [default: off]
+    #[arg(long, value_name = "MODE")]
+    zenoh_mode: Option<ZenohMode>,
+    /// Where a zenoh router listens; several are separated by commas
+    /// [env: LANEMAP_ZENOH_LISTEN] [default: tcp/127.0.0.1:7447]
+    #[arg(long, value_name = "ENDPOINTS")]
+    zenoh_listen: Option<Endpoints>,
+    /// Zenoh routers to connect to; several are separated by commas; a client needs one
+    /// [env: LANEMAP_ZENOH_CONNECT] [default: ]
+    #[arg(long, value_name = "ENDPOINTS")]
+    zenoh_connect: Option<Endpoints>,
+    /// Largest message of a vehicle, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
     #[arg(long, value_name = "BYTES")]
     max_message_bytes: Option<usize>,
     /// Most detections in a frame [env: LANEMAP_MAX_DETECTIONS] [default: 64]
@@ -144,6 +159,9 @@ impl ServeArgs {
             token_audience: self.token_audience.clone(),
             anonymous_read: self.anonymous_read,
             data_dir: self.data_dir.clone(),
+            zenoh_mode: self.zenoh_mode,
+            zenoh_listen: self.zenoh_listen.clone(),
+            zenoh_connect: self.zenoh_connect.clone(),
             max_message_bytes: self.max_message_bytes,
             max_detections: self.max_detections,
             max_points_per_detection: self.max_points_per_detection,

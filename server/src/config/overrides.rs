@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, path::PathBuf};
 
-use super::ServerConfig;
+use super::{Endpoints, ServerConfig, ZenohMode};
 
 /// The settings of [`ServerConfig`], each of which may be unset.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,6 +35,12 @@ pub struct ConfigOverrides {
     pub anonymous_read: Option<bool>,
     /// See [`ServerConfig::data_dir`].
     pub data_dir: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_mode`].
+    pub zenoh_mode: Option<ZenohMode>,
+    /// See [`ServerConfig::zenoh_listen`].
+    pub zenoh_listen: Option<Endpoints>,
+    /// See [`ServerConfig::zenoh_connect`].
+    pub zenoh_connect: Option<Endpoints>,
     /// See [`ServerConfig::max_message_bytes`].
     pub max_message_bytes: Option<usize>,
     /// See [`ServerConfig::max_detections`].
@@ -87,6 +93,9 @@ impl ConfigOverrides {
         set(&mut settings.token_audience, self.token_audience);
         set(&mut settings.anonymous_read, self.anonymous_read);
         set(&mut settings.data_dir, self.data_dir);
+        set(&mut settings.zenoh_mode, self.zenoh_mode);
+        set(&mut settings.zenoh_listen, self.zenoh_listen);
+        set(&mut settings.zenoh_connect, self.zenoh_connect);
         set(&mut settings.max_message_bytes, self.max_message_bytes);
         set(&mut settings.max_detections, self.max_detections);
         set(&mut settings.max_points_per_detection, self.max_points_per_detection);

@@ -1,0 +1,147 @@
+//! The zenoh side of ingest: the same conversation as over gRPC, carried by keys.
+//!
+//! # The wire
+//! Keys, encodings and attachments are in [`lanemap_proto::zenoh_keys`]; payloads are protobuf.
+//!
+//! 1. The vehicle chooses a random nonce for the stream, declares the liveliness token `.../@alive/{nonce}`, subscribes
+//!    to `.../acks` and `.../pose`, and puts `SessionStart` on `.../observations` as message 0. Where no `accepted` with
+//!    its nonce comes back in time, it begins anew with another nonce.
+//! 2. It puts frames, then `SessionEnd`, as messages 1, 2, 3 and so on, at most `max_frames_in_flight` of them unacked.
+//!    `CongestionControl::Block` and `Reliability::Reliable`; zenoh-ext's `AdvancedPublisher` with a cache of that many
+//!    samples and `sample_miss_detection` lets the server fetch what the transport lost.
+//! 3. The server puts `accepted`, `ack`, `refusal` and `ended` on `.../acks`, `pose` and `local_map` on `.../pose`, each
+//!    with the stream's nonce and a running number of its own per key. Acks are cumulative; poses may be dropped where
+//!    the vehicle is slow. `.../acks` is an `AdvancedPublisher` too: subscribe with recovery, and nothing is missed.
+//! 4. `closed{code, message}` is the last message of a stream, whatever ended it: 0 after `ended`, 10 ABORTED where a
+//!    newer stream of the drive took over, 14 UNAVAILABLE where the server shuts down or knows no such stream (it was
+//!    started anew), 8 `RESOURCE_EXHAUSTED` where more was sent than may be in flight, 15 `DATA_LOSS` where a message did
+//!    not arrive, 7 `PERMISSION_DENIED` where `SessionStart` names another vehicle than the key, 9 `FAILED_PRECONDITION`
+//!    where the stream has no liveliness token, 3 `INVALID_ARGUMENT` for what is no message. Whatever was not acked is
+//!    sent again on a new stream.
+//! 5. A message whose attachment cannot be read is answered by `closed` with nonce 0.
+//! 6. When the vehicle's token goes, its stream is closed as a broken gRPC stream is. While the server takes
+//!    observations it holds the token `lanemap/v1/@server`.
+//!
+//! Callbacks of zenoh never wait: they put into bounded queues. What publishes may wait for a slow vehicle, and does so
+//! beside the runtime's workers, one stream at a time.
+
+use std::{sync::Arc, time::Duration};
+
+use lanemap_proto::zenoh_keys;
+use tokio::time::timeout;
+use tokio_util::task::TaskTracker;
+use zenoh::{
+    Session,
+    handlers::Callback,
+    liveliness::LivelinessToken,
+    pubsub::Subscriber,
+    sample::{Sample, SampleKind},
+};
+use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, RecoveryConfig};
+
+use super::conversation::Conversations;
+use crate::config::ServerConfig;
+
+mod answers;
+mod inbound;
+mod streams;
+mod transport_config;
+mod turned_away;
+
+use streams::Streams;
+
+/// How long a lost message is waited for. What follows it waits meanwhile, so it is short.
+const RECOVERY_TIMEOUT: Duration = Duration::from_secs(2);
+/// How long a publisher that went silent is remembered.
+const RETENTION: Duration = Duration::from_mins(1);
+/// Time for the session's last words to its links.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Why the zenoh side does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ZenohError {
+    /// A setting does not read as zenoh's configuration.
+    #[error("zenoh's configuration: {name} = {value}: {reason}")]
+    Config {
+        /// The name within zenoh's own configuration.
+        name: &'static str,
+        /// Its value, as JSON.
+        value: String,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// The session cannot be opened, e.g. because the address is taken or no router answers.
+    #[error("opening the zenoh session: {0}")]
+    Open(String),
+    /// A subscription or a token cannot be declared.
+    #[error("declaring {what} in zenoh: {reason}")]
+    Declare {
+        /// What.
+        what: &'static str,
+        /// What zenoh says.
+        reason: String,
+    },
+}
+
+/// The server's session in zenoh, and what it declared there.
+pub(crate) struct ZenohIngest {
+    session: Session,
+    _observations: AdvancedSubscriber<()>,
+    _alive: Subscriber<()>,
+    _server: LivelinessToken,
+}
+
+impl ZenohIngest {
+    /// Opens the session and takes observations from now on. Tasks of streams are `tracked`.
+    pub(crate) async fn open(
+        config: &Arc<ServerConfig>,
+        conversations: Conversations,
+        tracked: TaskTracker,
+    ) -> Result<Self, ZenohError> {
+        let transport = transport_config::transport_config(config)?;
+        let session = zenoh::open(transport).await.map_err(|error| ZenohError::Open(error.to_string()))?;
+        let streams = Arc::new(Streams::new(config, conversations, session.clone(), tracked));
+        let observations = subscribe_to_observations(&session, Arc::clone(&streams))?;
+        let alive = subscribe_to_tokens(&session, streams)?;
+        let token = session.liveliness().declare_token(zenoh_keys::SERVER);
+        let server = token.await.map_err(declaring("the server's token"))?;
+        Ok(Self { session, _observations: observations, _alive: alive, _server: server })
+    }
+
+    /// Leaves zenoh; vehicles see the server's token go. Streams must have ended before.
+    pub(crate) async fn close(self) {
+        let Self { session, .. } = self;
+        match timeout(CLOSE_TIMEOUT, session.close()).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!(%error, "the zenoh session did not close cleanly"),
+            Err(_) => tracing::warn!("the zenoh session did not close in time"),
+        }
+    }
+}
+
+fn subscribe_to_observations(session: &Session, streams: Arc<Streams>) -> Result<AdvancedSubscriber<()>, ZenohError> {
+    use zenoh::Wait;
+    let take = Callback::from(move |sample: Sample| streams.take(&sample));
+    session
+        .declare_subscriber(zenoh_keys::EVERY_OBSERVATIONS)
+        .with(take)
+        .recovery(RecoveryConfig::default().retention_period(RETENTION).heartbeat())
+        .query_timeout(RECOVERY_TIMEOUT)
+        .wait()
+        .map_err(declaring("the subscription to observations"))
+}
+
+fn subscribe_to_tokens(session: &Session, streams: Arc<Streams>) -> Result<Subscriber<()>, ZenohError> {
+    use zenoh::Wait;
+    let note = move |sample: Sample| {
+        if sample.kind() == SampleKind::Delete {
+            streams.vehicle_gone(sample.key_expr().as_str());
+        }
+    };
+    let tokens = session.liveliness().declare_subscriber(zenoh_keys::EVERY_ALIVE);
+    tokens.callback(note).wait().map_err(declaring("the subscription to liveliness tokens"))
+}
+
+fn declaring(what: &'static str) -> impl FnOnce(zenoh::Error) -> ZenohError {
+    move |error| ZenohError::Declare { what, reason: error.to_string() }
+}

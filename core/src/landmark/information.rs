@@ -9,9 +9,9 @@
 //! correlated (`landmark::line_terms`), one frame couples all control points in view, and `W` is their number.
 //!
 //! * Rows are numbered by [`Knot`]s, which may be negative: both ends grow in O(1) and no index ever shifts.
-//! * Refactorisation and substitution stop at `W - 1` rows in succession that come out *bit for bit* as they were: all
-//!   later rows depend on these alone. So the factor and the solution are a pure function of the terms, whatever the
-//!   order of solving, and a restored lane goes on with the same bits.
+//! * Refactorisation and substitution stop where no further row depends on one that came out with other bits than it had.
+//!   So the factor and the solution are a pure function of the terms, whatever the order of solving, and a restored lane
+//!   goes on with the same bits. What a row reaches is often less than `W`: most of a wide band is empty.
 //! * Positions are kept relative to an anchor, so that a lane 10 km from the origin loses no digits.
 //!
 //! Not guaranteed: a solution where some control point is in no term at all; its row is singular. Chordal terms between
@@ -46,18 +46,21 @@ pub struct Term {
 struct Row<const W: usize> {
     /// `H[i][i - k]` for `k = 0 .. W`.
     band: [f64; W],
+    /// No entry further left than this is other than zero, and so none of the factor's.
+    reach: usize,
     /// `B[i]`, relative to the anchor.
     right: Vector3<f64>,
 }
 
 impl<const W: usize> Default for Row<W> {
     fn default() -> Self {
-        Self { band: [0.0; W], right: Vector3::zeros() }
+        Self { band: [0.0; W], reach: 0, right: Vector3::zeros() }
     }
 }
 
 impl<const W: usize> Row<W> {
     fn add(&mut self, other: &Self) {
+        self.reach = self.reach.max(other.reach);
         for (mine, theirs) in self.band.iter_mut().zip(other.band) {
             *mine += theirs;
         }
@@ -65,17 +68,22 @@ impl<const W: usize> Row<W> {
     }
 }
 
-/// One row of the factor: `D[i]`, `L[i][i - k]` for `k = 1 .. W` (`left[0]` is unused) and the forward substituted side.
+/// One row and one column of the factor: `D[i]`, `L[i + k][i]` for `k = 1 .. W` (`below[0]` is unused), and the forward
+/// substituted side. Columns lie in one piece because both sweeps read them so.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct FactorRow<const W: usize> {
     pivot: f64,
-    left: [f64; W],
+    /// Reach of the row that it was made of.
+    reach: usize,
+    /// No entry of `below` past this one was ever other than zero.
+    depth: usize,
+    below: [f64; W],
     forward: Vector3<f64>,
 }
 
 impl<const W: usize> Default for FactorRow<W> {
     fn default() -> Self {
-        Self { pivot: 1.0, left: [0.0; W], forward: Vector3::zeros() }
+        Self { pivot: 1.0, reach: 0, depth: 0, below: [0.0; W], forward: Vector3::zeros() }
     }
 }
 
@@ -116,14 +124,14 @@ struct StoredRow {
 
 impl<const W: usize> From<Row<W>> for StoredRow {
     fn from(row: Row<W>) -> Self {
-        let used = row.band.iter().rposition(|entry| *entry != 0.0).map_or(0, |last| last + 1);
-        Self { band: row.band[..used].to_vec(), right: row.right }
+        Self { band: row.band[..=row.reach].to_vec(), right: row.right }
     }
 }
 
 impl<const W: usize> From<StoredRow> for Row<W> {
     fn from(stored: StoredRow) -> Self {
-        let mut row = Self { right: stored.right, ..Self::default() };
+        let reach = stored.band.len().clamp(1, W) - 1;
+        let mut row = Self { right: stored.right, reach, ..Self::default() };
         row.band.iter_mut().zip(stored.band).for_each(|(mine, theirs)| *mine = theirs);
         row
     }
@@ -165,6 +173,7 @@ impl<const W: usize> BandedSum<W> {
             for back in 0..=k {
                 row.band[back] += scaled * term.weights[k - back];
             }
+            row.reach = row.reach.max(k);
             row.right += target * scaled;
         }
     }
@@ -183,6 +192,7 @@ impl<const W: usize> BandedSum<W> {
             for back in 0..=k {
                 row.band[back] += entries[k - back];
             }
+            row.reach = row.reach.max(k);
             row.right += term.right[k] - anchor.coords * entries.iter().sum::<f64>();
         }
     }
@@ -386,58 +396,77 @@ impl<const W: usize> BandedInformation<W> {
     /// Brings the control points up to date with the terms. Costs what changed, not what there is.
     pub fn solve(&mut self) {
         let Some((first, last)) = self.touched.take() else { return };
-        let end = self.refactorise(first, last);
-        self.substitute_back(first, end);
+        let (end, reached) = self.refactorise(first, last);
+        self.substitute_back(end, reached);
     }
 
-    /// Refactorises from `first`; returns the first row past `last` from which on nothing changed.
-    fn refactorise(&mut self, first: usize, last: usize) -> usize {
-        let mut unchanged = 0;
+    /// Refactorises from `first`. Returns the first row past `last` from which on nothing changes, and the first row whose
+    /// substitution takes anything from a row that was refactorised.
+    fn refactorise(&mut self, first: usize, last: usize) -> (usize, usize) {
+        let (mut changed, mut reached) = (last, first);
         for i in first..self.rows.len() {
-            let row = self.factor_row(i);
-            unchanged = if row == self.factor[i] { unchanged + 1 } else { 0 };
-            self.factor[i] = row;
-            if i >= last + W - 1 && unchanged >= W - 1 {
-                return i + 1;
+            if i > changed && !self.is_reached_from(i, changed) {
+                return (i, reached);
+            }
+            reached = reached.min(i.saturating_sub(self.rows[i].reach.max(self.factor[i].reach)));
+            if self.factor_row(i) {
+                changed = changed.max(i);
             }
         }
-        self.rows.len()
+        (self.rows.len(), reached)
     }
 
-    /// Row `i` of the factor, from the `W - 1` rows before it.
-    fn factor_row(&self, i: usize) -> FactorRow<W> {
-        let Row { band, right } = &self.rows[i];
-        let reach = i.min(W - 1);
-        // `scaled[k]` is `L[i][i - k] D[i - k]`, column by column from the left.
+    /// Whether row `i` or one after it depends on row `changed`.
+    fn is_reached_from(&self, i: usize, changed: usize) -> bool {
+        (i..self.rows.len().min(changed + W)).any(|later| self.rows[later].reach >= later - changed)
+    }
+
+    /// Makes row `i` of the factor from the `W - 1` rows before it; whether any bit of it is new.
+    fn factor_row(&mut self, i: usize) -> bool {
+        let Row { band, reach, right } = self.rows[i];
+        let before = i.min(reach.max(self.factor[i].reach));
+        // `scaled[k]` becomes `L[i][j] D[j]` of column `j = i - before + k`, column by column from the left.
         let mut scaled = [0.0; W];
-        let mut row = FactorRow { pivot: band[0], left: [0.0; W], forward: *right };
-        for back in (1..=reach).rev() {
-            let before = &self.factor[i - back];
-            let mut entry = band[back];
-            for (further, scaled) in scaled.iter().enumerate().take(reach + 1).skip(back + 1) {
-                entry -= scaled * before.left[further - back];
-            }
-            scaled[back] = entry;
-            row.left[back] = entry / before.pivot;
-            row.pivot -= row.left[back] * entry;
-            row.forward -= before.forward * row.left[back];
+        for (k, entry) in scaled.iter_mut().enumerate().take(before) {
+            *entry = band[before - k];
         }
-        row
+        let (mut pivot, mut forward, mut changed) = (band[0], right, false);
+        for k in 0..before {
+            let column = &mut self.factor[i - before + k];
+            let entry = scaled[k];
+            let left = entry / column.pivot;
+            for (later, below) in scaled[k + 1..before].iter_mut().zip(&column.below[1..]) {
+                *later -= entry * below;
+            }
+            pivot -= left * entry;
+            forward -= column.forward * left;
+            changed |= column.below[before - k].to_bits() != left.to_bits();
+            column.below[before - k] = left;
+            column.depth = column.depth.max(before - k);
+        }
+        let row = &mut self.factor[i];
+        changed |= row.pivot.to_bits() != pivot.to_bits() || row.forward != forward;
+        (row.pivot, row.reach, row.forward) = (pivot, reach, forward);
+        changed
     }
 
-    /// Substitutes back from `end` towards the head, until rows before `first` come out as they were.
-    fn substitute_back(&mut self, first: usize, end: usize) {
-        let mut unchanged = 0;
+    /// Substitutes back from `end` to `reached`, and on towards the head as far as control points move.
+    fn substitute_back(&mut self, end: usize, reached: usize) {
+        let mut reached = reached;
         for i in (0..end).rev() {
-            let mut offset = self.factor[i].forward / self.factor[i].pivot;
-            for ahead in 1..W.min(self.rows.len() - i) {
-                offset -= self.offsets[i + ahead] * self.factor[i + ahead].left[ahead];
-            }
-            unchanged = if offset == self.offsets[i] { unchanged + 1 } else { 0 };
-            self.offsets[i] = offset;
-            self.positions[i] = self.anchor + offset;
-            if i + W <= first && unchanged >= W - 1 {
+            if i < reached {
                 return;
+            }
+            let column = &self.factor[i];
+            let mut offset = column.forward / column.pivot;
+            let later = self.offsets.range(i + 1..self.rows.len().min(i + 1 + column.depth));
+            for (later, below) in later.zip(&column.below[1..]) {
+                offset -= later * *below;
+            }
+            if offset != self.offsets[i] {
+                self.offsets[i] = offset;
+                self.positions[i] = self.anchor + offset;
+                reached = reached.min(i.saturating_sub(self.rows[i].reach));
             }
         }
     }
@@ -453,7 +482,7 @@ impl<const W: usize> BandedInformation<W> {
         let mut after: VecDeque<[f64; W]> = VecDeque::with_capacity(W);
         for i in (from..count).rev() {
             let reach = after.len();
-            let below = |ahead: usize| self.factor[i + ahead].left[ahead];
+            let below = |ahead: usize| self.factor[i].below[ahead];
             let mut band = [0.0; W];
             for ahead in 1..=reach {
                 let inverse = |m: usize| after[ahead.min(m) - 1][ahead.abs_diff(m)];

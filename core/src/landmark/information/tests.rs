@@ -126,9 +126,9 @@ fn a_change_in_the_middle_of_a_long_lane_dies_out_to_the_last_bit() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     lane.add(&spline_term(&mut rng, 1_000, place(1_001)));
     let (first, last) = lane.touched.unwrap();
-    let end = lane.refactorise(first, last);
+    let (end, reached) = lane.refactorise(first, last);
     assert!(end < 1_400, "refactorised up to row {end}");
-    lane.substitute_back(first, end);
+    lane.substitute_back(end, reached);
     assert_eq!(lane.positions[100], before.positions[100]);
     assert_ne!(lane.positions[1_001], before.positions[1_001]);
 }

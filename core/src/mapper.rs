@@ -107,7 +107,7 @@ impl Mapper {
     pub fn step(&mut self, frame: &Frame) -> StepReport {
         let predicted = self.predict(frame);
         let observations = self.observe(frame);
-        let scene = Scene::around(&predicted.map_from_vehicle, &self.lanes, &self.index, &self.params);
+        let scene = Scene::around(&predicted, &self.lanes, &self.index, &self.params);
         let matching = self.associate(&observations, &scene, &predicted);
         self.pose = self.correct_pose(&observations, &scene, &matching, &predicted);
         let mut report = self.update_lanes(frame, &observations, &scene, &matching.lane_of);

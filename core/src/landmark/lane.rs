@@ -362,8 +362,10 @@ impl Landmark {
         let along = |a: f64, b: f64| if a <= b { (a, b) } else { (b, a) };
         let sighting =
             Sighting { reported: along(reported_from, reported_to), certain: along(certain_from, certain_to) };
-        let from = (near.0 as f64).max(head);
-        let to = head + curve.last_parameter();
+        // Farther beyond what was reported the detector sees nothing, and a lane may go on for kilometres.
+        let blind = params.blind_range_m / params.chord_m + 1.0;
+        let from = (sighting.reported.0 - blind).max(near.0 as f64).max(head);
+        let to = (sighting.reported.1 + blind).min(near.1 as f64).min(head + curve.last_parameter());
         let mut extent = std::mem::take(&mut self.extent);
         let curve = self.curve(params.ends);
         if let Some(curve) = curve {

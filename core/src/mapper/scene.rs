@@ -19,13 +19,18 @@ use crate::{
     params::Params,
     sensor::Sensor,
     spline::sampling::sample,
-    tracking::{Correspondence, MatchedLane},
+    tracking::{Correspondence, MatchedLane, PoseEstimate},
 };
 
 /// Lanes within this radius of the middle of the view are looked at, metres.
 const RADIUS_M: f64 = 55.0;
 /// The middle of the view, metres ahead of the vehicle.
 const MIDDLE_M: f64 = 28.0;
+/// Lanes are looked at this much farther to the side than they are observed, metres: a detection may be off, and a curve
+/// runs on between control points.
+const PLAY_M: f64 = 3.0;
+/// Middles of lanes that may be one lie nearer than this, metres.
+const TOGETHER_M: f64 = 2.0;
 /// Samples of a lane per chord, for association, which compares with the tangent at the nearest sample.
 const PIECES_PER_CHORD: usize = 1;
 
@@ -35,34 +40,43 @@ pub(super) struct Scene {
     pub runs: Vec<NearbyRun>,
     /// The same lanes as polylines in the vehicle frame at the predicted pose.
     pub shapes: Vec<LaneShape>,
+    /// How far to the right and to the left each shape goes, metres.
+    sides_m: Vec<(f64, f64)>,
 }
 
 impl Scene {
     /// The lanes around a predicted pose.
     pub fn around(
-        map_from_vehicle: &Pose,
+        predicted: &PoseEstimate,
         lanes: &BTreeMap<LaneId, Landmark>,
         index: &LaneIndex,
         params: &Params,
     ) -> Self {
+        let map_from_vehicle = &predicted.map_from_vehicle;
         let middle = map_from_vehicle * Point3::new(MIDDLE_M, 0.0, 0.0);
-        let (mut runs, mut shapes) = (Vec::new(), Vec::new());
+        let side_m = params.observation.side_m + play_m(predicted);
+        let (mut runs, mut shapes, mut sides_m) = (Vec::new(), Vec::new(), Vec::new());
         for run in index.within(&middle, RADIUS_M + STALE_M) {
             let Some(lane) = lanes.get(&run.lane) else { continue };
-            if let Some(shape) = shape_of(lane, &run, map_from_vehicle, params) {
+            if let Some(shape) = shape_of(lane, &run, map_from_vehicle, side_m, params) {
                 runs.push(run);
+                sides_m.push(sides_of(&shape));
                 shapes.push(shape);
             }
         }
-        Self { runs, shapes }
+        Self { runs, shapes, sides_m }
     }
 
     /// Whether the middles of two lanes lie near each other, which all duplicates' do.
     pub fn may_run_together(&self, a: usize, b: usize) -> bool {
+        let ((right_a, left_a), (right_b, left_b)) = (self.sides_m[a], self.sides_m[b]);
+        if right_a - left_b > TOGETHER_M || right_b - left_a > TOGETHER_M {
+            return false;
+        }
         let (a, b) = (&self.shapes[a], &self.shapes[b]);
         let (short, long) = if a.points.len() < b.points.len() { (a, b) } else { (b, a) };
         let middle = &short.points[short.points.len() / 2];
-        (long.points[long.nearest(middle)] - middle).norm() < 2.0
+        (long.points[long.nearest(middle)] - middle).norm() < TOGETHER_M
     }
 
     /// Matched observations with the foot points of their samples, for the pose update.
@@ -115,10 +129,33 @@ fn correspondences(
         .collect()
 }
 
-/// A nearby lane as a polyline in the vehicle frame.
-fn shape_of(lane: &Landmark, run: &NearbyRun, map_from_vehicle: &Pose, params: &Params) -> Option<LaneShape> {
+fn sides_of(shape: &LaneShape) -> (f64, f64) {
+    let widen = |(right, left): (f64, f64), point: &Point3<f64>| (right.min(point.y), left.max(point.y));
+    shape.points.iter().fold((f64::INFINITY, f64::NEG_INFINITY), widen)
+}
+
+/// How far to the side a line may lie from where it is seen, metres.
+fn play_m(predicted: &PoseEstimate) -> f64 {
+    let sigma = |axis: usize| predicted.covariance[(axis, axis)].max(0.0).sqrt();
+    PLAY_M + 3.0 * (sigma(1) + RADIUS_M * sigma(5))
+}
+
+/// A nearby lane as a polyline in the vehicle frame; `None` where all of it lies farther to the side than can be seen.
+fn shape_of(
+    lane: &Landmark,
+    run: &NearbyRun,
+    map_from_vehicle: &Pose,
+    side_m: f64,
+    params: &Params,
+) -> Option<LaneShape> {
+    let (first, last) = (lane.index_of(run.first), lane.index_of(run.last));
+    let vehicle_from_map = map_from_vehicle.inverse();
+    let beside = |point: &Point3<f64>| (vehicle_from_map * point).y.abs() <= side_m;
+    if !lane.positions().range(first..=last).any(beside) {
+        return None;
+    }
     let curve = lane.curve(params.landmark.ends)?;
-    let (from, to) = (lane.index_of(run.first) as f64, lane.index_of(run.last) as f64);
+    let (from, to) = (first as f64, last as f64);
     let points = sample(&curve, from, to, PIECES_PER_CHORD);
     if points.len() < 2 {
         return None;
@@ -126,7 +163,7 @@ fn shape_of(lane: &Landmark, run: &NearbyRun, map_from_vehicle: &Pose, params: &
     Some(LaneShape {
         category: lane.category.best(),
         category_log_likelihood: lane.category.log_likelihood(params.association.category_confusion),
-        points: points.iter().map(|point| map_from_vehicle.inverse_transform_point(point)).collect(),
+        points: points.iter().map(|point| vehicle_from_map * point).collect(),
     })
 }
 

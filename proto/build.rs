@@ -2,7 +2,8 @@
 
 use std::{env, error::Error, fs, path::PathBuf};
 
-const FILES: [&str; 5] = [
+const FILES: [&str; 6] = [
+    "lanemap/v1/admin_service.proto",
     "lanemap/v1/geometry.proto",
     "lanemap/v1/observation.proto",
     "lanemap/v1/lane_map.proto",

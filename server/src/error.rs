@@ -49,6 +49,9 @@ pub enum Error {
         /// What is wrong with it.
         reason: String,
     },
+    /// The drive's data were deleted on request.
+    #[error("this drive was deleted on request and takes no more frames; begin another drive")]
+    Forgotten,
     /// The session's actor ended while it was being spoken to; a new attempt starts another.
     #[error("the session has ended; try again")]
     SessionGone,
@@ -63,6 +66,7 @@ impl Error {
             Self::NoSuchSession { .. } => Code::NotFound,
             Self::Unauthenticated(_) => Code::Unauthenticated,
             Self::NotPermitted(_) => Code::PermissionDenied,
+            Self::Forgotten => Code::FailedPrecondition,
             Self::Superseded => Code::Aborted,
             Self::ShuttingDown | Self::Journal(_) | Self::SessionGone => Code::Unavailable,
             Self::Unreadable { .. } => Code::DataLoss,

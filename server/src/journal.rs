@@ -5,6 +5,7 @@
 //! disk: a crash leaves either all of a batch or nothing of it, and only a batch that was synced is acked.
 
 mod committer;
+mod erasure;
 mod named_records;
 mod record;
 mod store;
@@ -22,6 +23,7 @@ use crate::{
 };
 pub use committer::CommitterThread;
 use committer::{Commit, Committer};
+pub use erasure::ForgottenDrive;
 pub use record::{SessionKey, SessionRecord, SessionSetup};
 use store::Store;
 

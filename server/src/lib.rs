@@ -6,6 +6,7 @@
 //!
 //! A library without a `main`: the `lanemap` command and the tests start it with [`Server::start`].
 
+pub mod admin;
 pub mod auth;
 pub mod config;
 pub mod error;

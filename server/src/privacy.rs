@@ -7,6 +7,8 @@
 
 pub mod key;
 pub mod pseudonym;
+pub mod trip_cut;
 
 pub use key::{KeyError, PrivacyKey};
 pub use pseudonym::{DrivePseudonym, Pseudonyms, VehiclePseudonym};
+pub use trip_cut::TripCut;

@@ -72,6 +72,7 @@ impl FromRef<Shared> for ServeState {
 
 impl FromRef<Shared> for Extents {
     fn from_ref(shared: &Shared) -> Self {
+        shared.extents.drop_removed(&shared.state.sessions);
         shared.extents.clone()
     }
 }

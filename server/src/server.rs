@@ -3,7 +3,10 @@
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use axum::{Router, middleware};
-use lanemap_proto::v1::{self, ingest_service_server::IngestServiceServer, map_service_server::MapServiceServer};
+use lanemap_proto::v1::{
+    self, admin_service_server::AdminServiceServer, ingest_service_server::IngestServiceServer,
+    map_service_server::MapServiceServer,
+};
 use thiserror::Error;
 use tokio::{
     net::TcpListener,
@@ -16,6 +19,7 @@ use tonic::{codec::CompressionEncoding, service::Routes};
 use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
+    admin::AdminGrpc,
     auth::{
         layer::authenticate,
         reload::{CredentialError, Credentials},
@@ -121,8 +125,17 @@ impl Server {
         let streams = TaskTracker::new();
         let conversations =
             Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
-        let (health, router) = router(&config, IngestGrpc::new(conversations.clone()), http).await?;
+        let (ingest, admin) = (IngestGrpc::new(conversations.clone()), AdminGrpc::new(registry.clone()));
+        let (health, router) = router(&config, ingest, admin, http).await?;
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
+        tokio::spawn({
+            let registry = registry.clone();
+            async move {
+                if let Err(error) = registry.finish_forgetting().await {
+                    tracing::error!(%error, "a deletion that was interrupted cannot be finished");
+                }
+            }
+        });
         let zenoh = match config.zenoh_mode {
             ZenohMode::Off => None,
             ZenohMode::Router | ZenohMode::Client => {
@@ -314,11 +327,13 @@ fn warn_of_exposure(config: &ServerConfig) {
 async fn router(
     config: &ServerConfig,
     ingest: IngestGrpc,
+    admin: AdminGrpc,
     http: ServeState,
 ) -> Result<(HealthReporter, Router), StartError> {
     let (reporter, health) = tonic_health::server::health_reporter();
     reporter.set_serving::<IngestServiceServer<IngestGrpc>>().await;
     reporter.set_serving::<MapServiceServer<MapGrpc>>().await;
+    reporter.set_serving::<AdminServiceServer<AdminGrpc>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -330,6 +345,7 @@ async fn router(
         .accept_compressed(CompressionEncoding::Zstd);
     let routes = Routes::from(serve::router(http))
         .add_service(ingest)
+        .add_service(AdminServiceServer::new(admin))
         .add_service(maps)
         .add_service(health)
         .add_service(reflection);

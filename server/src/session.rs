@@ -5,6 +5,7 @@
 
 pub(crate) mod actor;
 pub(crate) mod drive;
+pub mod forget;
 pub mod id;
 pub mod published;
 mod recent;

@@ -10,6 +10,7 @@ use clap::{Parser, Subcommand};
 mod bench;
 mod demo;
 mod evaluate;
+mod forget;
 mod logging;
 mod record;
 mod recordings;
@@ -36,6 +37,8 @@ enum Command {
     Record(Box<record::RecordArgs>),
     /// Measures maps, poses and associations as the paper's tables do.
     Evaluate(evaluate::EvaluateArgs),
+    /// Deletes what a service has of a vehicle, or of one drive, and waits until it is gone.
+    Forget(forget::ForgetArgs),
     /// Serves, with a simulated fleet driving through a town: something to look at.
     Demo(demo::DemoArgs),
     /// Measures what a server bears: a load of many vehicles, and what the transport alone costs.
@@ -57,6 +60,7 @@ pub fn run() -> ExitCode {
         Command::Record(args) => record::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Forget(args) => forget::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };

@@ -8,7 +8,7 @@ use lanemap_proto::{
 };
 
 use super::Refusal;
-use crate::session::{SessionKey, SessionSetup};
+use crate::session::{SessionKey, SessionSetup, forget::Whom};
 
 /// Most characters of an id.
 const MAX_ID_CHARS: usize = 128;
@@ -40,6 +40,20 @@ pub fn start(message: &v1::SessionStart) -> Result<Start, Refusal> {
     let (sensor, point_frame) = decode::sensor(sensor)?;
     let setup = SessionSetup { preset: preset(message.preset)?, sensor };
     Ok(Start { key, setup, point_frame, wants_local_map: message.wants_local_map })
+}
+
+/// Decodes whom to forget.
+///
+/// # Errors
+/// The first name that is missing or out of range.
+pub fn forget(message: &v1::ForgetRequest) -> Result<Whom, Refusal> {
+    let fleet = id(&message.fleet_id, "fleet_id")?;
+    let vehicle = id(&message.vehicle_id, "vehicle_id")?;
+    let drive = message.drive_id.as_ref().map(|drive| id(drive, "drive_id")).transpose()?;
+    Ok(match drive {
+        Some(drive) => Whom::Drive(SessionKey { fleet, vehicle, drive }),
+        None => Whom::Vehicle { fleet, vehicle },
+    })
 }
 
 fn id(text: &str, field: &str) -> Result<String, Refusal> {

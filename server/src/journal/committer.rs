@@ -6,7 +6,7 @@ use lanemap_core::Sequence;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
-use super::{JournalError, JournalFrame, SessionRecord, store::Store, store::StoreBatch};
+use super::{JournalError, JournalFrame, SessionRecord, erasure::Forget, store::Store, store::StoreBatch};
 use crate::{session::SessionId, telemetry};
 
 /// Where a commit's outcome goes.
@@ -21,6 +21,8 @@ pub(super) enum Commit {
     Record { record: SessionRecord, done: Done },
     /// A snapshot, and the frames that it covers are removed.
     Snapshot { session: SessionId, covered: Sequence, bytes: Vec<u8>, done: Done },
+    /// All that there is of some drives is removed.
+    Forget { forget: Forget, done: Done },
 }
 
 /// The committing thread's state.
@@ -117,6 +119,10 @@ fn add(batch: &mut StoreBatch<'_>, commit: Commit) -> Result<(usize, Done), (Jou
             Ok((count, done))
         }
         Commit::Record { record, done } => match batch.put_record(&record) {
+            Ok(()) => Ok((0, done)),
+            Err(error) => Err((error, done)),
+        },
+        Commit::Forget { forget, done } => match batch.forget(&forget) {
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),
         },

@@ -6,10 +6,13 @@
 //! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard             |
 //! | `snapshots` | id                                           | the session's own bytes     |
 //! | `store`     | `privacy key`                                | the key's fingerprint       |
+//! |             | `erasure due`                                | none: what was removed is still on the disk |
+//! | `forgotten` | pseudonym of a drive that was deleted        | day of it                   |
+//! | `filler`    |                                              | see [`super::erasure`]      |
 //!
 //! No name of a fleet, a vehicle or a drive stands in any of them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use fjall::{Database, Keyspace, KeyspaceCreateOptions, OwnedWriteBatch, PersistMode};
 use lanemap_core::{Frame, Sequence};
@@ -24,16 +27,19 @@ const KEY_FINGERPRINT: &str = "privacy key";
 #[derive(Clone)]
 pub(super) struct Store {
     pub(super) database: Database,
-    records: Keyspace,
-    frames: Keyspace,
-    snapshots: Keyspace,
-    store: Keyspace,
+    pub(super) folder: PathBuf,
+    pub(super) records: Keyspace,
+    pub(super) frames: Keyspace,
+    pub(super) snapshots: Keyspace,
+    pub(super) store: Keyspace,
+    pub(super) forgotten: Keyspace,
+    pub(super) filler: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
 pub(super) struct StoreBatch<'a> {
-    store: &'a Store,
-    batch: OwnedWriteBatch,
+    pub(super) store: &'a Store,
+    pub(super) batch: OwnedWriteBatch,
 }
 
 impl std::fmt::Debug for Store {
@@ -47,8 +53,8 @@ impl Store {
         let database = Database::builder(folder).open()?;
         let keyspace = |name| database.keyspace(name, KeyspaceCreateOptions::default);
         let (records, frames, snapshots) = (keyspace("records")?, keyspace("frames")?, keyspace("snapshots")?);
-        let store = keyspace("store")?;
-        Ok(Self { database, records, frames, snapshots, store })
+        let (store, forgotten, filler) = (keyspace("store")?, keyspace("forgotten")?, keyspace("filler")?);
+        Ok(Self { folder: folder.to_owned(), database, records, frames, snapshots, store, forgotten, filler })
     }
 
     pub(super) fn batch(&self) -> StoreBatch<'_> {
@@ -112,6 +118,16 @@ impl StoreBatch<'_> {
             self.batch.remove(&self.store.frames, entry.key()?);
         }
         self.batch.insert(&self.store.snapshots, session.to_key(), bytes);
+        Ok(())
+    }
+
+    /// Removes all that the store has of a session.
+    pub(super) fn remove_session(&mut self, session: SessionId) -> Result<(), JournalError> {
+        for entry in self.store.frames.prefix(session.to_key()) {
+            self.batch.remove(&self.store.frames, entry.key()?);
+        }
+        self.batch.remove(&self.store.snapshots, session.to_key());
+        self.batch.remove(&self.store.records, session.to_key());
         Ok(())
     }
 

@@ -5,16 +5,21 @@
 
 use std::{
     collections::BTreeMap,
-    sync::{Arc, Mutex, PoisonError},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use super::{bounds::Bounds, sessions::control_points};
-use crate::session::{MapVersion, PublishedMap, SessionId};
+use crate::session::{MapVersion, PublishedMap, SessionId, Sessions};
 
 /// The borders that are known. Clones share them; there is one per session, and the registry bounds the sessions.
 #[derive(Clone, Debug, Default)]
 pub struct Extents {
     known: Arc<Mutex<BTreeMap<SessionId, Known>>>,
+    /// [`Sessions::removals`] at the last [`Extents::drop_removed`].
+    removals: Arc<AtomicU64>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +40,14 @@ impl Extents {
         let bounds = Bounds::around(georeference, control_points(&map.map));
         self.lock().insert(map.session, Known { version: map.version, bounds });
         bounds
+    }
+
+    /// Drops the borders of sessions that are no longer there.
+    pub fn drop_removed(&self, sessions: &Sessions) {
+        let removals = sessions.removals();
+        if self.removals.swap(removals, Ordering::Relaxed) != removals {
+            self.lock().retain(|session, _| sessions.get(session).is_some());
+        }
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<SessionId, Known>> {

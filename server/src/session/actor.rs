@@ -51,6 +51,8 @@ pub(crate) enum Command {
     End { stream: StreamNumber },
     /// The stream closes; what it was promised is sent first, then `with`.
     Detach { stream: StreamNumber, with: Result<(), Status> },
+    /// The drive is to be deleted: the actor leaves at once and saves nothing.
+    Forget,
 }
 
 /// A stream that opens.
@@ -119,6 +121,8 @@ enum ActorError {
     Journal(#[from] JournalError),
     #[error("the drive's state cannot be saved: {0}")]
     Drive(#[from] DriveError),
+    #[error("the drive is to be deleted")]
+    Forgotten,
 }
 
 impl Actor {
@@ -147,6 +151,12 @@ impl Actor {
     /// Runs until the session leaves memory, the service shuts down, or the journal fails.
     pub(crate) async fn run(mut self) {
         if let Err(error) = self.serve().await {
+            if matches!(error, ActorError::Forgotten) {
+                if let Some(stream) = self.stream.take() {
+                    stream.outbox.finish(Err(Error::Forgotten.into()));
+                }
+                return;
+            }
             tracing::error!(session = %self.record.id, %error, "the session ends");
             let status = Status::unavailable(error.to_string());
             self.detach(Err(status));
@@ -199,6 +209,7 @@ impl Actor {
                     self.commit(&mut batch).await?;
                     self.end(stream).await?;
                 }
+                Command::Forget => return Err(ActorError::Forgotten),
                 Command::Detach { stream, with } => {
                     self.commit(&mut batch).await?;
                     if self.is_current(stream) {

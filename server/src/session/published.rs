@@ -6,7 +6,10 @@
 use std::{
     collections::BTreeMap,
     fmt,
-    sync::{Arc, PoisonError, RwLock},
+    sync::{
+        Arc, PoisonError, RwLock,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use arc_swap::ArcSwap;
@@ -74,6 +77,7 @@ pub struct Sessions {
 struct Shared {
     maps: RwLock<BTreeMap<SessionId, Arc<ArcSwap<PublishedMap>>>>,
     publications: watch::Sender<u64>,
+    removals: AtomicU64,
 }
 
 impl Sessions {
@@ -106,6 +110,22 @@ impl Sessions {
             maps.insert(session, Arc::new(ArcSwap::new(published)));
         }
         self.shared.publications.send_modify(|count| *count += 1);
+    }
+
+    /// Takes a session's map away from readers; those that hold it keep it as long as they like.
+    pub fn remove(&self, session: &SessionId) {
+        let mut maps = self.shared.maps.write().unwrap_or_else(PoisonError::into_inner);
+        if maps.remove(session).is_some() {
+            self.shared.removals.fetch_add(1, Ordering::Relaxed);
+        }
+        drop(maps);
+        self.shared.publications.send_modify(|count| *count += 1);
+    }
+
+    /// Counts removals: tells who keeps something of each session that something is to be dropped.
+    #[must_use]
+    pub fn removals(&self) -> u64 {
+        self.shared.removals.load(Ordering::Relaxed)
     }
 
     /// Counts publications of all sessions: tells a reader that something is newer than when it looked.

@@ -25,12 +25,13 @@ use super::{
     SessionId, SessionKey, SessionRecord, SessionState,
     actor::{Actor, Attach, Attached, Command, StreamNumber, Surroundings},
     drive::Drive,
+    forget::Forgotten,
 };
 use crate::{
     error::Error,
     ingest::{Outbox, Refusal, decode::Start},
     journal::{Journal, JournalError},
-    privacy::{DrivePseudonym, Pseudonyms},
+    privacy::{DrivePseudonym, Pseudonyms, VehiclePseudonym},
     telemetry,
 };
 
@@ -64,30 +65,39 @@ impl From<OpenError> for Status {
 /// All sessions of the store. Clones share them.
 #[derive(Clone)]
 pub(crate) struct SessionRegistry {
-    shared: Arc<Shared>,
+    pub(super) shared: Arc<Shared>,
 }
 
-struct Shared {
-    surroundings: Surroundings,
-    slots: Mutex<HashMap<DrivePseudonym, Arc<AsyncMutex<Slot>>>>,
+pub(super) struct Shared {
+    pub(super) surroundings: Surroundings,
+    pub(super) slots: Mutex<HashMap<DrivePseudonym, Place>>,
+    pub(super) forgotten: Mutex<Forgotten>,
+    /// Held by the deletion that is under way.
+    pub(super) forgetting: AsyncMutex<()>,
     last_id: Mutex<Option<SessionId>>,
     live: Arc<Semaphore>,
     streams: AtomicU64,
     actors: TaskTracker,
 }
 
-/// One drive: vacant until its record is durable.
-#[derive(Default)]
-struct Slot {
-    record: Option<SessionRecord>,
-    actor: Option<ActorHandle>,
+/// Where a drive is kept.
+pub(super) struct Place {
+    pub(super) vehicle: VehiclePseudonym,
+    pub(super) slot: Arc<AsyncMutex<Slot>>,
 }
 
-struct ActorHandle {
-    commands: mpsc::Sender<Command>,
+/// One drive: vacant until its record is durable.
+#[derive(Default)]
+pub(super) struct Slot {
+    pub(super) record: Option<SessionRecord>,
+    pub(super) actor: Option<ActorHandle>,
+}
+
+pub(super) struct ActorHandle {
+    pub(super) commands: mpsc::Sender<Command>,
     /// The outbox of the newest stream, finished when a newer one opens.
-    outbox: Outbox,
-    task: JoinHandle<()>,
+    pub(super) outbox: Outbox,
+    pub(super) task: JoinHandle<()>,
 }
 
 /// A stream's hold on its session.
@@ -106,19 +116,21 @@ impl SessionRegistry {
     /// A session that cannot be read is reported and left as it is; the others are served.
     pub(crate) async fn recover(surroundings: Surroundings) -> Result<Self, JournalError> {
         let journal = surroundings.journal.clone();
-        let records = blocking(move || journal.records()).await?;
+        let (records, forgotten) = blocking(move || Ok((journal.records()?, journal.forgotten()?))).await?;
         let mut slots = HashMap::with_capacity(records.len());
         let last_id = records.last().map(|record| record.id);
         stream::iter(&records).for_each_concurrent(cores(), |record| recover_one(&surroundings, record)).await;
         for record in records {
-            let slot = Slot { record: Some(record.clone()), actor: None };
-            slots.insert(record.drive, Arc::new(AsyncMutex::new(slot)));
+            let slot = Slot { record: Some(record.clone()), ..Slot::default() };
+            slots.insert(record.drive, Place { vehicle: record.vehicle, slot: Arc::new(AsyncMutex::new(slot)) });
         }
         metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
         let shared = Shared {
             live: Arc::new(Semaphore::new(surroundings.config.max_live_sessions)),
             surroundings,
             slots: Mutex::new(slots),
+            forgotten: Mutex::new(Forgotten::new(forgotten)),
+            forgetting: AsyncMutex::default(),
             last_id: Mutex::new(last_id),
             streams: AtomicU64::new(0),
             actors: TaskTracker::new(),
@@ -129,8 +141,10 @@ impl SessionRegistry {
     /// Opens a stream of a drive: begins the drive or resumes it, and supersedes a stream that is still open.
     pub(crate) async fn open(&self, start: &Start, outbox: &Outbox) -> Result<Attachment, OpenError> {
         let live = self.live_permit().map_err(OpenError::Refused)?;
-        let slot = self.slot(self.pseudonyms().drive(&start.key)).map_err(OpenError::Refused)?;
+        let slot = self.slot(start)?;
         let mut slot = slot.lock().await;
+        // It may have been deleted while this waited for it.
+        self.check_not_forgotten(self.pseudonyms().drive(&start.key))?;
         let record = self.record(&mut slot, start).await?;
         if let Some(actor) = &slot.actor {
             actor.outbox.finish(Err(Error::Superseded.into()));
@@ -159,21 +173,34 @@ impl SessionRegistry {
         permit.map(LivePermit::new).map_err(|_| capacity("streams", maximum))
     }
 
-    fn pseudonyms(&self) -> &Pseudonyms {
+    fn check_not_forgotten(&self, drive: DrivePseudonym) -> Result<(), Error> {
+        if self.forgotten().contains(drive) { Err(Error::Forgotten) } else { Ok(()) }
+    }
+
+    pub(super) fn pseudonyms(&self) -> &Pseudonyms {
         &self.shared.surroundings.pseudonyms
     }
 
-    fn slot(&self, drive: DrivePseudonym) -> Result<Arc<AsyncMutex<Slot>>, Refusal> {
+    pub(super) fn remove(&self, drive: DrivePseudonym) {
+        let mut slots = locked(&self.shared.slots);
+        slots.remove(&drive);
+        metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
+    }
+
+    fn slot(&self, start: &Start) -> Result<Arc<AsyncMutex<Slot>>, OpenError> {
+        let drive = self.pseudonyms().drive(&start.key);
+        let vehicle = self.pseudonyms().vehicle(&start.key.fleet, &start.key.vehicle);
         let maximum = self.shared.surroundings.config.max_sessions;
         let mut slots = locked(&self.shared.slots);
-        if let Some(slot) = slots.get(&drive) {
-            return Ok(Arc::clone(slot));
+        self.check_not_forgotten(drive)?;
+        if let Some(place) = slots.get(&drive) {
+            return Ok(Arc::clone(&place.slot));
         }
         if slots.len() >= maximum {
-            return Err(capacity("drives", maximum));
+            return Err(OpenError::Refused(capacity("drives", maximum)));
         }
         let slot = Arc::<AsyncMutex<Slot>>::default();
-        slots.insert(drive, Arc::clone(&slot));
+        slots.insert(drive, Place { vehicle, slot: Arc::clone(&slot) });
         metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
         Ok(slot)
     }
@@ -350,6 +377,6 @@ async fn blocking<T: Send + 'static>(
     })
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(super) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

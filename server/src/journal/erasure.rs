@@ -1,0 +1,219 @@
+//! Forgets drives, and makes what was deleted leave the disk.
+//!
+//! The embedded store is log-structured: a deleted value stays in its write-ahead logs and tables until they are written
+//! anew. That happens here, by force: the logs that were there are outgrown and go, and every table is compacted.
+
+use std::{
+    collections::BTreeSet,
+    fs, io,
+    path::{Path, PathBuf},
+};
+
+use fjall::Keyspace;
+use xxhash_rust::xxh3::xxh3_64;
+
+use super::{
+    Journal, JournalError,
+    committer::Commit,
+    decode_error,
+    store::{Store, StoreBatch},
+};
+use crate::{privacy::DrivePseudonym, session::SessionId};
+
+/// Key in the keyspace `store` that is there from a deletion until it has left the disk.
+const ERASURE_DUE: &str = "erasure due";
+
+/// Length of one filler; the store begins a new log where one has outgrown 64 MB.
+const FILLER_BYTES: usize = 8 << 20;
+/// Fillers after which a log must have been outgrown, many times over.
+const MOST_FILLERS: u64 = 64;
+
+/// A drive that was forgotten.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ForgottenDrive {
+    /// The drive.
+    pub drive: DrivePseudonym,
+    /// The day, counted from 1970.
+    pub day: u32,
+}
+
+/// What is to be removed, in one step.
+#[derive(Debug)]
+pub(super) struct Forget {
+    sessions: Vec<SessionId>,
+    drives: Vec<ForgottenDrive>,
+    /// Forgotten drives that need not be remembered any more.
+    outdated: Vec<DrivePseudonym>,
+}
+
+impl Journal {
+    /// Removes all that there is of `sessions` and remembers that `drives` were forgotten, in one step; `outdated` need
+    /// not be remembered any more. [`Journal::erase`] makes it leave the disk.
+    ///
+    /// # Errors
+    /// The store failed: nothing was removed.
+    pub async fn forget(
+        &self,
+        sessions: Vec<SessionId>,
+        drives: Vec<ForgottenDrive>,
+        outdated: Vec<DrivePseudonym>,
+    ) -> Result<(), JournalError> {
+        let forget = Forget { sessions, drives, outdated };
+        self.commit(|done| Commit::Forget { forget, done }).await
+    }
+
+    /// Makes everything that was removed leave the disk.
+    ///
+    /// # Errors
+    /// The store failed, or has no room to be written anew: [`Journal::erasure_is_due`] stays.
+    pub async fn erase(&self) -> Result<(), JournalError> {
+        let store = self.store.clone();
+        let erasing = tokio::task::spawn_blocking(move || {
+            store.erase_deleted()?;
+            Ok(store.store.remove(ERASURE_DUE)?)
+        });
+        erasing.await.unwrap_or_else(|error| Err(JournalError::Store(format!("erasing: {error}"))))
+    }
+
+    /// Whether something was removed that has not left the disk, e.g. because of a crash between.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn erasure_is_due(&self) -> Result<bool, JournalError> {
+        Ok(self.store.store.contains_key(ERASURE_DUE)?)
+    }
+
+    /// The drives that were forgotten.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn forgotten(&self) -> Result<Vec<ForgottenDrive>, JournalError> {
+        let decode = |entry: fjall::Guard| {
+            let (key, value) = entry.into_inner()?;
+            let decoded = postcard::from_bytes(&key).and_then(|drive| Ok((drive, postcard::from_bytes(&value)?)));
+            let (drive, day) = decoded.map_err(|error| decode_error("a forgotten drive", &error))?;
+            Ok(ForgottenDrive { drive, day })
+        };
+        self.store.forgotten.iter().map(decode).collect()
+    }
+}
+
+impl StoreBatch<'_> {
+    pub(super) fn forget(&mut self, forget: &Forget) -> Result<(), JournalError> {
+        for session in &forget.sessions {
+            self.remove_session(*session)?;
+        }
+        let encode_error = |error| decode_error("a forgotten drive", &error);
+        for ForgottenDrive { drive, day } in &forget.drives {
+            let (key, value) = (postcard::to_stdvec(drive), postcard::to_stdvec(day));
+            self.batch.insert(&self.store.forgotten, key.map_err(encode_error)?, value.map_err(encode_error)?);
+        }
+        for drive in &forget.outdated {
+            self.batch.remove(&self.store.forgotten, postcard::to_stdvec(drive).map_err(encode_error)?);
+        }
+        self.erasure_due();
+        Ok(())
+    }
+
+    /// What this batch removes must leave the disk, even after a crash.
+    pub(super) fn erasure_due(&mut self) {
+        self.batch.insert(&self.store.store, ERASURE_DUE, []);
+    }
+}
+
+impl Store {
+    /// Writes all logs and tables anew without what was deleted. Other writes may go on meanwhile. Takes a second, and
+    /// as long as it takes to write every table.
+    pub(super) fn erase_deleted(&self) -> Result<(), JournalError> {
+        self.outgrow_logs()?;
+        for keyspace in self.keyspaces() {
+            keyspace.major_compact()?;
+        }
+        // Tables that were compacted away are kept for readers of the past, until something new is written.
+        self.settle()
+    }
+
+    /// Fills the log until every log that is there now has been replaced and removed.
+    fn outgrow_logs(&self) -> Result<(), JournalError> {
+        let before = logs(&self.folder)?;
+        for number in 0..MOST_FILLERS {
+            self.filler.insert("filler", filler(number))?;
+            self.settle()?;
+            if logs(&self.folder)?.is_disjoint(&before) {
+                self.filler.clear()?;
+                return Ok(());
+            }
+        }
+        Err(JournalError::Store("its logs do not give way to new ones".to_owned()))
+    }
+
+    /// Writes what is in memory to tables.
+    fn settle(&self) -> Result<(), JournalError> {
+        self.filler.insert("settled", [])?;
+        for keyspace in self.keyspaces() {
+            keyspace.rotate_memtable_and_wait()?;
+        }
+        self.filler.rotate_memtable_and_wait()?;
+        Ok(())
+    }
+
+    fn keyspaces(&self) -> [&Keyspace; 5] {
+        [&self.records, &self.frames, &self.snapshots, &self.store, &self.forgotten]
+    }
+}
+
+fn logs(folder: &Path) -> Result<BTreeSet<PathBuf>, JournalError> {
+    let read = || -> io::Result<BTreeSet<PathBuf>> {
+        let files = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
+        Ok(files.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "jnl")).collect())
+    };
+    read().map_err(|error| JournalError::Store(format!("its folder: {error}")))
+}
+
+/// Bytes that no compression makes shorter.
+fn filler(number: u64) -> Vec<u8> {
+    let words = (0..FILLER_BYTES as u64 / 8).map(|word| xxh3_64(&(number << 32 | word).to_le_bytes()));
+    words.flat_map(u64::to_le_bytes).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{journal::JournalFrame, session::SessionId};
+    use lanemap_core::Sequence;
+
+    /// Whether a file below `folder` holds `pattern`.
+    fn holds(folder: &Path, pattern: &[u8]) -> bool {
+        fs::read_dir(folder).unwrap().any(|entry| {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                return holds(&path, pattern);
+            }
+            fs::read(path).unwrap().windows(pattern.len()).any(|window| window == pattern)
+        })
+    }
+
+    #[test]
+    fn what_was_deleted_is_on_no_disk_afterwards_and_what_was_not_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        let (gone, kept) = (SessionId::next(None, 0, 1), SessionId::next(None, 0, 2));
+        let (gone_bytes, kept_bytes) = (b"to be forgotten".to_vec(), b"to be kept, too".to_vec());
+        let mut batch = store.batch();
+        for (session, bytes) in [(gone, &gone_bytes), (kept, &kept_bytes)] {
+            batch.put_frame(session, JournalFrame { sequence: Sequence(1), bytes: bytes.clone() });
+            batch.put_snapshot(session, Sequence(0), bytes.clone()).unwrap();
+        }
+        batch.commit().unwrap();
+        store.settle().unwrap();
+        assert!(holds(folder.path(), &gone_bytes) && holds(folder.path(), &kept_bytes));
+
+        let mut batch = store.batch();
+        batch.remove_session(gone).unwrap();
+        batch.commit().unwrap();
+        store.erase_deleted().unwrap();
+        assert!(!holds(folder.path(), &gone_bytes));
+        assert!(holds(folder.path(), &kept_bytes));
+        assert_eq!(store.snapshot(kept).unwrap(), Some(kept_bytes));
+    }
+}

@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{privacy::DrivePseudonym, session::SessionId};
 
-/// Key in the keyspace `store` that is there from a deletion until it has left the disk.
+/// Key in the keyspace `facts` that is there from a deletion until it has left the disk.
 const ERASURE_DUE: &str = "erasure due";
 
 /// Length of one filler; the store begins a new log where one has outgrown 64 MB.
@@ -70,7 +70,7 @@ impl Journal {
         let store = self.store.clone();
         let erasing = tokio::task::spawn_blocking(move || {
             store.erase_deleted()?;
-            Ok(store.store.remove(ERASURE_DUE)?)
+            Ok(store.facts.remove(ERASURE_DUE)?)
         });
         erasing.await.unwrap_or_else(|error| Err(JournalError::Store(format!("erasing: {error}"))))
     }
@@ -80,7 +80,7 @@ impl Journal {
     /// # Errors
     /// The store cannot be read.
     pub fn erasure_is_due(&self) -> Result<bool, JournalError> {
-        Ok(self.store.store.contains_key(ERASURE_DUE)?)
+        Ok(self.store.facts.contains_key(ERASURE_DUE)?)
     }
 
     /// The drives that were forgotten.
@@ -117,7 +117,7 @@ impl StoreBatch<'_> {
 
     /// What this batch removes must leave the disk, even after a crash.
     pub(super) fn erasure_due(&mut self) {
-        self.batch.insert(&self.store.store, ERASURE_DUE, []);
+        self.batch.insert(&self.store.facts, ERASURE_DUE, []);
     }
 }
 
@@ -158,7 +158,7 @@ impl Store {
     }
 
     fn keyspaces(&self) -> [&Keyspace; 5] {
-        [&self.records, &self.frames, &self.snapshots, &self.store, &self.forgotten]
+        [&self.records, &self.frames, &self.snapshots, &self.facts, &self.forgotten]
     }
 }
 

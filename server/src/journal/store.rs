@@ -5,7 +5,7 @@
 //! | `records`   | id, 8 bytes big-endian                       | record, postcard            |
 //! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard             |
 //! | `snapshots` | id                                           | the session's own bytes     |
-//! | `store`     | `privacy key`                                | the key's fingerprint       |
+//! | `facts`     | `privacy key`                                | the key's fingerprint       |
 //! |             | `erasure due`                                | none: what was removed is still on the disk |
 //! | `forgotten` | pseudonym of a drive that was deleted        | day of it                   |
 //! | `filler`    |                                              | see [`super::erasure`]      |
@@ -20,7 +20,7 @@ use lanemap_core::{Frame, Sequence};
 use super::{JournalError, JournalFrame, SessionRecord, decode_error};
 use crate::{privacy::pseudonym::KeyFingerprint, session::SessionId};
 
-/// Key of the privacy key's fingerprint in the keyspace `store`.
+/// Key of the privacy key's fingerprint in the keyspace `facts`.
 const KEY_FINGERPRINT: &str = "privacy key";
 
 /// The keyspaces of one folder.
@@ -31,7 +31,7 @@ pub(super) struct Store {
     pub(super) records: Keyspace,
     pub(super) frames: Keyspace,
     pub(super) snapshots: Keyspace,
-    pub(super) store: Keyspace,
+    pub(super) facts: Keyspace,
     pub(super) forgotten: Keyspace,
     pub(super) filler: Keyspace,
 }
@@ -53,8 +53,8 @@ impl Store {
         let database = Database::builder(folder).open()?;
         let keyspace = |name| database.keyspace(name, KeyspaceCreateOptions::default);
         let (records, frames, snapshots) = (keyspace("records")?, keyspace("frames")?, keyspace("snapshots")?);
-        let (store, forgotten, filler) = (keyspace("store")?, keyspace("forgotten")?, keyspace("filler")?);
-        Ok(Self { folder: folder.to_owned(), database, records, frames, snapshots, store, forgotten, filler })
+        let (facts, forgotten, filler) = (keyspace("facts")?, keyspace("forgotten")?, keyspace("filler")?);
+        Ok(Self { folder: folder.to_owned(), database, records, frames, snapshots, facts, forgotten, filler })
     }
 
     pub(super) fn batch(&self) -> StoreBatch<'_> {
@@ -70,7 +70,7 @@ impl Store {
     }
 
     pub(super) fn key_fingerprint(&self) -> Result<Option<KeyFingerprint>, JournalError> {
-        let Some(bytes) = self.store.get(KEY_FINGERPRINT)? else { return Ok(None) };
+        let Some(bytes) = self.facts.get(KEY_FINGERPRINT)? else { return Ok(None) };
         let bytes = (*bytes).try_into().map_err(|_| JournalError::Decode {
             what: "the fingerprint of the privacy key".to_owned(),
             reason: format!("it has {} bytes", bytes.len()),
@@ -97,7 +97,7 @@ impl StoreBatch<'_> {
     }
 
     pub(super) fn put_key_fingerprint(&mut self, fingerprint: KeyFingerprint) {
-        self.batch.insert(&self.store.store, KEY_FINGERPRINT, fingerprint.0);
+        self.batch.insert(&self.store.facts, KEY_FINGERPRINT, fingerprint.0);
     }
 
     pub(super) fn put_record(&mut self, record: &SessionRecord) -> Result<(), JournalError> {

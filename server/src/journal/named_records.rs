@@ -93,7 +93,7 @@ mod tests {
             if journal.key_fingerprint().unwrap().is_none() {
                 journal.adopt_key(&pseudonyms).unwrap();
             }
-            assert_eq!(journal.records().unwrap(), [expected.clone()]);
+            assert_eq!(journal.records().unwrap(), std::slice::from_ref(&expected));
             assert!(!journal.store.database.keyspace_exists(NAMED));
             drop(journal);
             thread.join().await;

@@ -23,7 +23,10 @@ use crate::{
 /// Events kept for a slow reader.
 const EVENTS: usize = 4096;
 
-/// Streams drives to one service, over gRPC (`http://host:port`, `https://...`). Clones share the connection.
+/// Streams drives to one service, over gRPC (`http://host:port`, `https://...`) or zenoh (`tcp/host:port`, `tls/...`).
+///
+/// Over gRPC clones and their sessions share a connection; over zenoh every stream has one of its own, and tokio's
+/// multi-thread runtime is needed.
 #[derive(Clone, Debug)]
 pub struct IngestClient {
     link: Link,
@@ -57,7 +60,7 @@ pub struct SessionSummary {
 }
 
 impl IngestClient {
-    /// Connects to a service, e.g. `http://127.0.0.1:8080`.
+    /// Connects to a service, e.g. `http://127.0.0.1:8080` or `tcp/127.0.0.1:7447`.
     ///
     /// # Errors
     /// An address that is not one, or nobody there.
@@ -265,6 +268,15 @@ impl Session {
     /// As [`Session::finish`].
     pub async fn close(self) -> Result<SessionSummary, ClientError> {
         self.leave(Leaving::Close).await
+    }
+
+    /// Leaves at once. What is not acked stays in the spool, for the next session of the drive; without a spool it is lost.
+    pub async fn abort(mut self) {
+        self.task.abort();
+        // Its outcome is that it was aborted, or how it ended before.
+        let _ = (&mut self.task).await;
+        // Nobody is left to close the backlog.
+        let _ = self.backlog.close(false).await;
     }
 
     async fn leave(mut self, leaving: Leaving) -> Result<SessionSummary, ClientError> {

@@ -1,32 +1,19 @@
-"""Streams one drive to lanemap: python stream_drive.py HOST:PORT (message types made from proto/ by grpc_tools)."""
+"""Streams one drive to lanemap: python stream_drive.py http://localhost:8080"""
 import sys, time
-from math import cos, degrees, sin
-import grpc
-from lanemap.v1 import geometry_pb2 as geo, ingest_service_pb2 as ingest, ingest_service_pb2_grpc as rpc, observation_pb2 as obs
-
-def pose(x, y, z, yaw):
-    return geo.Pose(position=geo.Point(x=x, y=y, z=z), rotation=geo.Quaternion(z=sin(yaw / 2), w=cos(yaw / 2)))
+import numpy as np
+import lanemap
 
 def measure(n, radius=300.0):  # put your sensors here: this vehicle follows a bend to the left at 10 m/s between two lines
-    turn, lines = n / radius, []
-    east, north = radius * sin(turn), radius * (1 - cos(turn))
-    for r in (radius + 1.75, radius - 1.75):
-        xyz = [c for s in range(5, 50, 3) for c in (r * sin(s / radius), radius - r * cos(s / radius), 0.0)]
-        lines.append(obs.Detection(category=obs.LANE_CATEGORY_WHITE_SOLID, xyz=xyz))
-    place = geo.GeodeticPosition(latitude_deg=48.1 + degrees(north / 6.37e6), longitude_deg=11.6 + degrees(east / 4.27e6))
-    return lines, pose(east, north, 0, turn), obs.GnssFix(position=place, horizontal_sigma_m=1, vertical_sigma_m=2, yaw_enu_rad=turn)
+    turn, ahead = n / radius, np.arange(5, 50, 3) / radius
+    lines = [np.column_stack([r * np.sin(ahead), radius - r * np.cos(ahead), 0 * ahead]) for r in (radius + 1.75, radius - 1.75)]
+    east, north = radius * np.sin(turn), radius * (1 - np.cos(turn))
+    fix = lanemap.GnssFix(48.1 + np.degrees(north / 6.37e6), 11.6 + np.degrees(east / 4.27e6), yaw_enu_rad=turn)
+    return lanemap.Pose.planar(east, north, turn), [lanemap.Detection(line, "white_solid") for line in lines], fix
 
-def drive(start_ns=time.time_ns()):
-    camera = obs.Sensor(vehicle_from_sensor=pose(1.5, 0, 1.6, 0), axis_convention=obs.AXIS_CONVENTION_VEHICLE)
-    yield dict(start=ingest.SessionStart(fleet_id="docs", vehicle_id="car-1", drive_id=str(start_ns), sensor=camera))
+start_ns = time.time_ns()
+camera = lanemap.Sensor(lanemap.Pose(1.5, 0, 1.6), axes="vehicle")
+with lanemap.Session(sys.argv[1], fleet="docs", vehicle="car-1", drive=str(start_ns), sensor=camera, spool="target/spool") as session:
     for n in range(1, 201):  # 20 s at 10 Hz
-        lines, odometry, fix = measure(n)
-        frame = obs.Frame(sequence=n, time_unix_ns=start_ns + n * 100_000_000, gnss=fix, detections=lines)
-        frame.odometry.odometry_from_vehicle.CopyFrom(odometry)
-        yield dict(frame=frame)
-    yield dict(end=ingest.SessionEnd())
-
-requests = (ingest.StreamObservationsRequest(**message) for message in drive())
-for response in rpc.IngestServiceStub(grpc.insecure_channel(sys.argv[1])).StreamObservations(requests):
-    if response.WhichOneof("message") in ("accepted", "refusal", "ended"):
-        print(response)
+        pose, lines, fix = measure(n)
+        session.send(start_ns + n * 100_000_000, pose, lines, gnss=fix)
+    print(f"{session.finish()} of session {session.id}")

@@ -9,6 +9,8 @@ pub mod bags;
 pub mod drives;
 pub mod folders;
 pub mod http;
+pub mod proxy;
+pub mod python;
 pub mod raw_stream;
 pub mod raw_zenoh;
 pub mod servers;

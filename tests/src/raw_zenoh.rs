@@ -20,6 +20,7 @@ use zenoh::{
     qos::CongestionControl,
     sample::{Sample, SampleKind},
 };
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 /// Longest wait for an answer before a test fails; an answer takes milliseconds.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -67,6 +68,7 @@ pub struct RawZenohStream {
     poses: Subscriber<RingChannelHandler<Sample>>,
     token: Option<LivelinessToken>,
     next_ack: u64,
+    recoverable: Option<AdvancedPublisher<'static>>,
 }
 
 impl RawZenohStream {
@@ -91,7 +93,17 @@ impl RawZenohStream {
             nonce: next_nonce(),
             next_number: 0,
             next_ack: 0,
+            recoverable: None,
         }
+    }
+
+    /// Lets the server fetch again what the transport lost of the last `cached` messages.
+    pub async fn make_recoverable(&mut self, cached: usize) {
+        let publisher = self.session.declare_publisher(self.keys.observations()).encoding(REQUEST_ENCODING);
+        let publisher = publisher.congestion_control(CongestionControl::Block);
+        let publisher = publisher.cache(CacheConfig::default().max_samples(cached));
+        let detection = MissDetectionConfig::default().heartbeat(Duration::from_millis(50));
+        self.recoverable = Some(publisher.sample_miss_detection(detection).await.unwrap());
     }
 
     /// Opens a stream and a session, as the vehicle that the start names.
@@ -124,7 +136,10 @@ impl RawZenohStream {
     pub async fn send_bytes(&mut self, bytes: Vec<u8>) {
         let attachment = Attachment { nonce: self.nonce, number: self.next_number };
         self.next_number += 1;
-        self.put(bytes, Some(&attachment.to_string())).await;
+        match &self.recoverable {
+            Some(publisher) => publisher.put(bytes).attachment(attachment.to_string()).await.unwrap(),
+            None => self.put(bytes, Some(&attachment.to_string())).await,
+        }
     }
 
     /// Puts bytes with any attachment.

@@ -417,3 +417,52 @@ async fn streams_over_zenoh_count_among_all_streams() {
     three.send(Request::Start(start_of(&drive, "three"))).await;
     assert_eq!(Code::from(three.closed().await.code), Code::ResourceExhausted);
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_link_loses_is_fetched_again_and_the_map_is_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = free_endpoint();
+    let server = Server::start(config(folder.path(), &endpoint)).await.unwrap();
+    // A vehicle whose link lets five messages a second through, and loses all others.
+    let mut lossy = raw_zenoh::configuration("client", &[], &[&endpoint]);
+    let rules = r#"[{ "key_expr": "lanemap/v1/*/*/observations", "freq": 5.0 }]"#;
+    let loss = format!(r#"[{{ "flows": ["egress"], "messages": ["put"], "rules": {rules} }}]"#);
+    lossy.insert_json5("downsampling", &loss).unwrap();
+    let session = zenoh::open(lossy).await.unwrap();
+    let drive = drives::simulated(5, 90);
+    let start = drive.wire_start();
+    let mut stream = RawZenohStream::open(&session, &start.fleet_id, &start.vehicle_id).await;
+    stream.make_recoverable(2 * IN_FLIGHT).await;
+    let accepted = stream.start(start).await;
+    stream.stream(&drive.frames, IN_FLIGHT).await;
+    stream.end_drive().await;
+    assert_same_map(&map_bytes(&server.url(), &accepted.session_id).await, &drive);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_that_never_reads_slows_no_neighbour_and_loses_its_stream() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, session) = server_and_session(folder.path()).await;
+    let deaf_session = {
+        let endpoint = session.info().links().await.next().unwrap().dst().to_string();
+        raw_zenoh::connect(&endpoint).await
+    };
+    let drive = drives::simulated(5, 200);
+    let (mut deaf, deaf_accepted) = RawZenohStream::started(&deaf_session, start_of(&drive, "deaf")).await;
+    // Refusals may not be dropped: once nobody reads them, they wait, and then the link is cut.
+    let deaf_id: SessionId = deaf_accepted.session_id.parse().unwrap();
+    let cut = async {
+        while server.sessions().get(&deaf_id).unwrap().state != SessionState::Idle {
+            for frame in &drive.frames[..8] {
+                deaf.send_frame(v1::Frame { odometry: None, ..encode::frame(frame) }).await;
+            }
+        }
+    };
+    let neighbour = async {
+        let (mut stream, accepted) = RawZenohStream::started(&session, start_of(&drive, "neighbour")).await;
+        stream.stream(&drive.frames, IN_FLIGHT).await;
+        stream.end_drive().await;
+        assert_same_map(&map_bytes(&server.url(), &accepted.session_id).await, &drive);
+    };
+    tokio::join!(cut, neighbour);
+}

@@ -5,8 +5,9 @@ use std::io::IsTerminal;
 use clap::{Args, ValueEnum};
 use tracing_subscriber::{EnvFilter, Layer, layer::SubscriberExt, util::SubscriberInitExt};
 
-/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business.
-const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn";
+/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business, and zenoh's notes and
+/// warnings name keys and certificates, which name vehicles.
+const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn,zenoh=error";
 
 /// Where the service tells what it does.
 #[derive(Args, Clone, Debug, Default)]

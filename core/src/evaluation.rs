@@ -12,6 +12,7 @@ mod polynomial;
 pub mod pose_error;
 pub mod quantile;
 pub mod score_box;
+mod shown_heading;
 pub mod strict_scorer;
 
 pub use association_score::{AssociationMean, AssociationScore};
@@ -21,4 +22,5 @@ pub use ground_frame::GroundFrame;
 pub use pose_error::{RelativePoseError, relative_pose_error};
 pub use quantile::quantile;
 pub use score_box::ScoreBox;
+pub use shown_heading::shown_heading;
 pub use strict_scorer::{LineError, StrictScore, score_strict};

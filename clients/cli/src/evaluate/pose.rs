@@ -1,14 +1,17 @@
 //! Pose: relative pose error of the corrected poses under odometry noise, over 10, 30 and 50 m.
 //!
-//! Beside it odometry itself, and the limit: what remains when lane lines have taken away all lateral and all yaw error of
-//! the same draws, as they say nothing of the way along a straight road.
+//! Beside it odometry itself, and two limits. `limit`: what remains when lane lines have taken away all lateral and all yaw
+//! error of the same draws, as they say nothing of the way along a straight road. `true map`: what the detector's own errors
+//! leave of the heading when every frame is read against the true lines, whose number and place it knows.
 
 use clap::Args;
 use lanemap_core::{
     Mapper, Params, Pose,
-    evaluation::{RelativePoseError, relative_pose_error},
+    evaluation::{RelativePoseError, relative_pose_error, shown_heading},
+    geometry::pose::perturb,
 };
-use lanemap_openlane::{MotionNoise, apply_motion_noise};
+use lanemap_openlane::{DriveFrame, MotionNoise, apply_motion_noise};
+use nalgebra::Vector6;
 use serde_json::{Value, json};
 
 use super::{
@@ -91,12 +94,24 @@ fn one_draw(
     let mut methods =
         vec![("odometry", errors(&odometry)), ("limit", errors(&apply_motion_noise(&drive.poses, &along)))];
     let frames = drive.mapper_frames(&odometry, noise)?;
+    methods.push(("true map", errors(&read_off_true_map(drive))));
     for preset in args.common.preset.presets() {
         let mut mapper = Mapper::new(Params::preset(*preset), drive.sensor());
         let corrected: Vec<Pose> = frames.iter().map(|frame| mapper.step(frame).map_from_vehicle).collect();
         methods.push((preset_name(*preset), errors(&corrected)));
     }
     Ok(methods)
+}
+
+/// True poses, turned by what each frame's detections show of the heading; a frame that shows nothing repeats the last.
+fn read_off_true_map(drive: &RecordedDrive) -> Vec<Pose> {
+    let mut yaw_rad = 0.0;
+    let mut read = |(frame, pose): (&DriveFrame, &Pose)| {
+        let detections: Vec<_> = frame.detections_vehicle().into_iter().map(|seen| seen.points_vehicle).collect();
+        yaw_rad = shown_heading(&frame.truth_vehicle(), &detections).unwrap_or(yaw_rad);
+        perturb(pose, &Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, -yaw_rad))
+    };
+    drive.frames.iter().zip(&drive.poses).map(&mut read).collect()
 }
 
 fn add(total: &mut Vec<(&'static str, Errors)>, more: &[(&'static str, Errors)]) {
@@ -114,7 +129,8 @@ fn add(total: &mut Vec<(&'static str, Errors)>, more: &[(&'static str, Errors)])
 fn as_text(args: &PoseArgs, levels: &[Level]) -> String {
     let mut text = format!(
         "Relative pose error, mean of {} draws from seed {}: rotation (deg) / translation (m).\n\
-         limit: the same draws without their lateral and yaw parts.\n\n",
+         limit: the same draws without their lateral and yaw parts.\n\
+         true map: the heading that each frame shows against the true lines; its translation is of no meaning.\n\n",
         args.draws, args.common.seed
     );
     let mut table = Table::new(&["noise (deg, m)", "", "10 m", "30 m", "50 m"]);

@@ -1,7 +1,7 @@
 //! Pose: relative pose error of the corrected poses under odometry noise, over 10, 30 and 50 m.
 //!
 //! Beside it odometry itself, and two limits. `limit`: what remains when lane lines have taken away all lateral and all yaw
-//! error of the same draws, as they say nothing of the way along a straight road. `true map`: what the detector's own errors
+//! error of the same draws, as they say nothing of the way along a straight road. `true_map`: what the detector's own errors
 //! leave of the heading when every frame is read against the true lines, whose number and place it knows.
 
 use clap::Args;
@@ -94,7 +94,7 @@ fn one_draw(
     let mut methods =
         vec![("odometry", errors(&odometry)), ("limit", errors(&apply_motion_noise(&drive.poses, &along)))];
     let frames = drive.mapper_frames(&odometry, noise)?;
-    methods.push(("true map", errors(&read_off_true_map(drive))));
+    methods.push(("true_map", errors(&read_off_true_map(drive))));
     for preset in args.common.preset.presets() {
         let mut mapper = Mapper::new(Params::preset(*preset), drive.sensor());
         let corrected: Vec<Pose> = frames.iter().map(|frame| mapper.step(frame).map_from_vehicle).collect();
@@ -130,7 +130,7 @@ fn as_text(args: &PoseArgs, levels: &[Level]) -> String {
     let mut text = format!(
         "Relative pose error, mean of {} draws from seed {}: rotation (deg) / translation (m).\n\
          limit: the same draws without their lateral and yaw parts.\n\
-         true map: the heading that each frame shows against the true lines; its translation is of no meaning.\n\n",
+         true_map: the heading that each frame shows against the true lines; its translation is of no meaning.\n\n",
         args.draws, args.common.seed
     );
     let mut table = Table::new(&["noise (deg, m)", "", "10 m", "30 m", "50 m"]);

@@ -5,6 +5,7 @@
 //! Beside them, for the eye, `foxglove.SceneUpdate` (the detected lines), `foxglove.FrameTransform` (the odometry) and
 //! `foxglove.LocationFix`; the reader passes over these, as over any other channel.
 
+mod descriptors;
 mod reader;
 mod records;
 mod scene;

@@ -12,7 +12,7 @@ use lanemap_proto::{encode, v1};
 use mcap::{Compression, McapError, WriteOptions, Writer, records::MessageHeader};
 use prost::Message;
 
-use super::{FRAME_SCHEMA, START_SCHEMA, scene};
+use super::{FRAME_SCHEMA, START_SCHEMA, descriptors::schema_of, scene};
 use crate::error::RecordingError;
 
 /// Size at which a chunk is closed, bytes before compression: what a crash can cost, beside [`FLUSH_AFTER_S`].
@@ -152,7 +152,7 @@ impl<W: Write + Seek> McapRecorder<W> {
 impl Channels {
     fn declare<W: Write + Seek>(writer: &mut Writer<W>) -> Result<Self, McapError> {
         let mut declare = |topic, schema, descriptors| {
-            let schema = writer.add_schema(schema, "protobuf", descriptors)?;
+            let schema = writer.add_schema(schema, "protobuf", &schema_of(schema, descriptors))?;
             writer.add_channel(schema, topic, "protobuf", &BTreeMap::new())
         };
         Ok(Self {

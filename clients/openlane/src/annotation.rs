@@ -50,8 +50,18 @@ impl Annotation {
     /// # Errors
     /// A file that cannot be read, is cut short, or whose fields have another shape; the error names file and field.
     pub fn read(path: &Path) -> Result<Self, OpenLaneError> {
-        let document = Document::read(path)?;
-        let root = document.root();
+        Self::parse(path, &Document::read(path)?.root())
+    }
+
+    /// Reads the text of an annotation; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`Annotation::read`].
+    pub fn from_json(path: &Path, text: &[u8]) -> Result<Self, OpenLaneError> {
+        Self::parse(path, &Document::parse(path, text)?.root())
+    }
+
+    fn parse(path: &Path, root: &Node<'_>) -> Result<Self, OpenLaneError> {
         let pose = |key| root.find(key).map(|node| node.pose()).transpose();
         Ok(Self {
             path: path.to_owned(),

@@ -36,8 +36,19 @@ impl DetectionFile {
     /// # Errors
     /// A file that cannot be read, is cut short, or whose fields have another shape; the error names file and field.
     pub fn read(path: &Path) -> Result<Self, OpenLaneError> {
-        let document = Document::read(path)?;
-        let lanes = document.root().get("lane_lines")?.items()?.map(|lane| DetectedLane::parse(&lane));
+        Self::parse(&Document::read(path)?.root())
+    }
+
+    /// Reads the text of a result file; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`DetectionFile::read`].
+    pub fn from_json(path: &Path, text: &[u8]) -> Result<Self, OpenLaneError> {
+        Self::parse(&Document::parse(path, text)?.root())
+    }
+
+    fn parse(root: &Node<'_>) -> Result<Self, OpenLaneError> {
+        let lanes = root.get("lane_lines")?.items()?.map(|lane| DetectedLane::parse(&lane));
         Ok(Self { lanes: lanes.collect::<Result<_, _>>()? })
     }
 }

@@ -28,9 +28,13 @@ impl Document {
         if bytes > MAX_FILE_BYTES {
             return Err(OpenLaneError::TooLarge { path: path.to_owned(), bytes, limit: MAX_FILE_BYTES });
         }
-        let text = fs::read(path).map_err(io)?;
+        Self::parse(path, &fs::read(path).map_err(io)?)
+    }
+
+    /// The document that `text` holds; `path` is for messages.
+    pub(crate) fn parse(path: &Path, text: &[u8]) -> Result<Self, OpenLaneError> {
         let root =
-            serde_json::from_slice(&text).map_err(|source| OpenLaneError::Json { path: path.to_owned(), source })?;
+            serde_json::from_slice(text).map_err(|source| OpenLaneError::Json { path: path.to_owned(), source })?;
         Ok(Self { path: path.to_owned(), root })
     }
 

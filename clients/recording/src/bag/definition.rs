@@ -162,6 +162,14 @@ impl Definitions {
         Ok(definitions)
     }
 
+    /// Whether `bytes` are exactly one message of this definition.
+    ///
+    /// # Errors
+    /// What of it is torn, or how many bytes are too many.
+    pub fn check(&self, bytes: &[u8]) -> Result<(), String> {
+        super::view::message(self, bytes).map(drop)
+    }
+
     pub(crate) fn message(&self, place: usize) -> &MessageType {
         &self.types[place]
     }

@@ -175,7 +175,8 @@ impl FromStr for StreamNonce {
     }
 }
 
-/// What is attached to every message of a stream, in both directions: 32 hexadecimal digits, lower case.
+/// What is attached to every message of a stream, in both directions: 32 hexadecimal digits, lower case. A vehicle that
+/// shows a bearer token adds it to that of message 0 ([`attachment_with_token`]).
 ///
 /// Each direction numbers its messages by itself, and the server numbers `acks` and `pose` each by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,7 +187,7 @@ pub struct Attachment {
     pub number: u64,
 }
 
-/// An attachment that is not 32 hexadecimal digits in lower case.
+/// An attachment that does not read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error(
     "the attachment is not 32 hexadecimal digits, lower case: 16 of the stream's nonce, 16 of the message's number"
@@ -202,6 +203,28 @@ impl Attachment {
         let (nonce, number) = bytes.split_at_checked(16).ok_or(AttachmentError)?;
         let nonce = StreamNonce(hex16(nonce).ok_or(AttachmentError)?);
         Ok(Self { nonce, number: hex16(number).ok_or(AttachmentError)? })
+    }
+}
+
+/// The attachment of a stream's message 0 with a bearer token: after the 32 digits come a blank and the token.
+#[must_use]
+pub fn attachment_with_token(attachment: Attachment, token: &str) -> String {
+    format!("{attachment} {token}")
+}
+
+/// Reads the bytes of an attachment that may hold a token, as [`attachment_with_token`] writes it.
+///
+/// # Errors
+/// Anything else; also a token on another message than the first.
+pub fn parse_with_token(bytes: &[u8]) -> Result<(Attachment, Option<&str>), AttachmentError> {
+    let Some((attachment, rest)) = bytes.split_at_checked(32).filter(|(_, rest)| !rest.is_empty()) else {
+        return Ok((Attachment::parse(bytes)?, None));
+    };
+    let attachment = Attachment::parse(attachment)?;
+    let token = rest.strip_prefix(b" ").and_then(|token| std::str::from_utf8(token).ok());
+    match token.filter(|_| attachment.number == 0) {
+        Some(token) => Ok((attachment, Some(token))),
+        None => Err(AttachmentError),
     }
 }
 
@@ -258,6 +281,18 @@ mod tests {
         assert_eq!(Attachment::parse(attachment.to_string().as_bytes()), Ok(attachment));
         for bytes in [&b""[..], b"0000000000000007", b"0000000000000007FFFFFFFFFFFFFFFF", &[0xff; 32], &[b'+'; 32]] {
             assert_eq!(Attachment::parse(bytes), Err(AttachmentError));
+        }
+    }
+
+    #[test]
+    fn a_token_travels_with_the_first_message_only() {
+        let first = Attachment { nonce: StreamNonce(7), number: 0 };
+        let with_token = attachment_with_token(first, "a.b.c");
+        assert_eq!(parse_with_token(with_token.as_bytes()), Ok((first, Some("a.b.c"))));
+        assert_eq!(parse_with_token(first.to_string().as_bytes()), Ok((first, None)));
+        let second = attachment_with_token(Attachment { number: 1, ..first }, "a.b.c");
+        for refused in [second.as_str(), &with_token[..31], &format!("{first}a.b.c")] {
+            assert_eq!(parse_with_token(refused.as_bytes()), Err(AttachmentError), "{refused}");
         }
     }
 

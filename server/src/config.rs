@@ -11,6 +11,7 @@ use thiserror::Error;
 
 use crate::auth::exposure;
 
+mod credentials;
 mod overrides;
 mod zenoh;
 
@@ -18,6 +19,7 @@ pub use overrides::ConfigOverrides;
 pub use zenoh::{EndpointError, Endpoints, ModeError, ZenohMode};
 
 /// Every setting of the service.
+#[expect(clippy::struct_excessive_bools, reason = "each is a switch of its own, named as users set it")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
@@ -56,6 +58,21 @@ pub struct ServerConfig {
     pub zenoh_listen: Endpoints,
     /// Zenoh routers to connect to, e.g. `tcp/router:7447`; several are separated by commas. A client needs one.
     pub zenoh_connect: Endpoints,
+    /// Vehicles that may connect to the router with a certificate of `tls_client_ca_file`: a common name `fleet/vehicle`
+    /// on each line. Each may use its own keys only.
+    pub zenoh_vehicles_file: Option<PathBuf>,
+    /// Vehicles that may connect to the router with a password: `fleet/vehicle:password` on each line. Each may use its
+    /// own keys only. With `zenoh_vehicles_file`, both are asked for.
+    pub zenoh_passwords_file: Option<PathBuf>,
+    /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts.
+    pub zenoh_ca_file: Option<PathBuf>,
+    /// Name with which a zenoh client connects to its router.
+    pub zenoh_user: Option<String>,
+    /// File of the password of `zenoh_user`.
+    pub zenoh_password_file: Option<PathBuf>,
+    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as `lanemap zenoh-access` has
+    /// it.
+    pub zenoh_trust_router: bool,
     /// Largest message of a vehicle, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
     pub max_message_bytes: usize,
     /// Most detections in a frame, at least 1.
@@ -115,6 +132,12 @@ impl Default for ServerConfig {
             zenoh_mode: ZenohMode::Off,
             zenoh_listen: Endpoints::loopback(),
             zenoh_connect: Endpoints::default(),
+            zenoh_vehicles_file: None,
+            zenoh_passwords_file: None,
+            zenoh_ca_file: None,
+            zenoh_user: None,
+            zenoh_password_file: None,
+            zenoh_trust_router: false,
             max_message_bytes: 32 * 1024 * 1024,
             max_detections: limits.max_detections,
             max_points_per_detection: limits.max_points_per_detection,
@@ -230,23 +253,6 @@ impl ServerConfig {
         within("max_tls_handshakes", self.max_tls_handshakes as f64, 1.0, 1e6, "1 ..= 1e6")?;
         self.check_credentials()?;
         exposure::check(self)
-    }
-
-    /// Checks that no setting of TLS or tokens stands without those that it needs.
-    fn check_credentials(&self) -> Result<(), ConfigError> {
-        let needs = |name, is_set: bool, met: bool, needs| {
-            if is_set && !met { Err(ConfigError::Incomplete { name, needs }) } else { Ok(()) }
-        };
-        let (certificate, key) = (self.tls_cert_file.is_some(), self.tls_key_file.is_some());
-        let clients = self.tls_client_ca_file.is_some();
-        needs("tls_cert_file", certificate, key, "tls_key_file")?;
-        needs("tls_key_file", key, certificate, "tls_cert_file")?;
-        needs("tls_client_ca_file", clients, certificate, "tls_cert_file and tls_key_file")?;
-        needs("tls_client_crl_file", self.tls_client_crl_file.is_some(), clients, "tls_client_ca_file")?;
-        needs("tls_require_client_certificate", self.tls_require_client_certificate, clients, "tls_client_ca_file")?;
-        let (keys, issuer) = (self.token_keys_file.is_some(), self.token_issuer.is_some());
-        needs("token_keys_file", keys, issuer, "token_issuer")?;
-        needs("token_issuer", issuer, keys, "token_keys_file")
     }
 
     fn check_zenoh(&self) -> Result<(), ConfigError> {

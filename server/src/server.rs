@@ -138,9 +138,10 @@ impl Server {
         });
         let zenoh = match config.zenoh_mode {
             ZenohMode::Off => None,
-            ZenohMode::Router | ZenohMode::Client => {
-                Some(ZenohIngest::open(&config, conversations, streams.clone()).await?)
-            }
+            ZenohMode::Router | ZenohMode::Client => Some(
+                ZenohIngest::open(&config, conversations, Arc::clone(&credentials.authenticator), streams.clone())
+                    .await?,
+            ),
         };
 
         let running = Running {

@@ -81,6 +81,28 @@ pub struct ServeArgs {
     /// [env: LANEMAP_ZENOH_CONNECT] [default: ]
     #[arg(long, value_name = "ENDPOINTS")]
     zenoh_connect: Option<Endpoints>,
+    /// Vehicles that may connect to the router with a certificate of --tls-client-ca-file: a common name fleet/vehicle
+    /// on each line; each may use its own keys only [env: LANEMAP_ZENOH_VEHICLES_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    zenoh_vehicles_file: Option<PathBuf>,
+    /// Vehicles that may connect to the router with a password: fleet/vehicle:password on each line; each may use its
+    /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    zenoh_passwords_file: Option<PathBuf>,
+    /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts
+    /// [env: LANEMAP_ZENOH_CA_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    zenoh_ca_file: Option<PathBuf>,
+    /// Name with which a zenoh client connects to its router [env: LANEMAP_ZENOH_USER] [default: none]
+    #[arg(long, value_name = "NAME")]
+    zenoh_user: Option<String>,
+    /// File of the password of --zenoh-user [env: LANEMAP_ZENOH_PASSWORD_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    zenoh_password_file: Option<PathBuf>,
+    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as lanemap zenoh-access has it
+    /// [env: LANEMAP_ZENOH_TRUST_ROUTER] [default: false]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    zenoh_trust_router: Option<bool>,
     /// Largest message of a vehicle, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
     #[arg(long, value_name = "BYTES")]
     max_message_bytes: Option<usize>,
@@ -162,6 +184,12 @@ impl ServeArgs {
             zenoh_mode: self.zenoh_mode,
             zenoh_listen: self.zenoh_listen.clone(),
             zenoh_connect: self.zenoh_connect.clone(),
+            zenoh_vehicles_file: self.zenoh_vehicles_file.clone(),
+            zenoh_passwords_file: self.zenoh_passwords_file.clone(),
+            zenoh_ca_file: self.zenoh_ca_file.clone(),
+            zenoh_user: self.zenoh_user.clone(),
+            zenoh_password_file: self.zenoh_password_file.clone(),
+            zenoh_trust_router: self.zenoh_trust_router,
             max_message_bytes: self.max_message_bytes,
             max_detections: self.max_detections,
             max_points_per_detection: self.max_points_per_detection,

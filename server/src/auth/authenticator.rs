@@ -42,7 +42,7 @@ pub type Identity = Result<CertificateIdentity, CertificateNameError>;
 #[derive(Debug)]
 pub struct Authenticator {
     tokens: Option<Tokens>,
-    takes_certificates: bool,
+    is_on: bool,
     anonymous_read: bool,
 }
 
@@ -64,14 +64,13 @@ impl Authenticator {
             (Some(file), Some(issuer)) => Some(Tokens::load(file.clone(), issuer, &config.token_audience)?),
             _ => None,
         };
-        let takes_certificates = config.tls_client_ca_file.is_some();
-        Ok(Self { tokens, takes_certificates, anonymous_read: config.anonymous_read })
+        Ok(Self { tokens, is_on: config.asks_who_peers_are(), anonymous_read: config.anonymous_read })
     }
 
     /// Whether peers are asked who they are.
     #[must_use]
     pub fn is_on(&self) -> bool {
-        self.tokens.is_some() || self.takes_certificates
+        self.is_on
     }
 
     /// Who shows this certificate and this `authorization`.

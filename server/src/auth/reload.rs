@@ -30,7 +30,7 @@ pub struct CredentialError {
 }
 
 impl CredentialError {
-    pub(super) fn new(setting: &'static str, path: &Path, source: impl Into<Box<dyn StdError + Send + Sync>>) -> Self {
+    pub(crate) fn new(setting: &'static str, path: &Path, source: impl Into<Box<dyn StdError + Send + Sync>>) -> Self {
         Self { setting, path: path.display().to_string(), source: source.into() }
     }
 }

@@ -41,6 +41,18 @@ pub struct ConfigOverrides {
     pub zenoh_listen: Option<Endpoints>,
     /// See [`ServerConfig::zenoh_connect`].
     pub zenoh_connect: Option<Endpoints>,
+    /// See [`ServerConfig::zenoh_vehicles_file`].
+    pub zenoh_vehicles_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_passwords_file`].
+    pub zenoh_passwords_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_ca_file`].
+    pub zenoh_ca_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_user`].
+    pub zenoh_user: Option<String>,
+    /// See [`ServerConfig::zenoh_password_file`].
+    pub zenoh_password_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_trust_router`].
+    pub zenoh_trust_router: Option<bool>,
     /// See [`ServerConfig::max_message_bytes`].
     pub max_message_bytes: Option<usize>,
     /// See [`ServerConfig::max_detections`].
@@ -96,6 +108,12 @@ impl ConfigOverrides {
         set(&mut settings.zenoh_mode, self.zenoh_mode);
         set(&mut settings.zenoh_listen, self.zenoh_listen);
         set(&mut settings.zenoh_connect, self.zenoh_connect);
+        set_optional(&mut settings.zenoh_vehicles_file, self.zenoh_vehicles_file);
+        set_optional(&mut settings.zenoh_passwords_file, self.zenoh_passwords_file);
+        set_optional(&mut settings.zenoh_ca_file, self.zenoh_ca_file);
+        set_optional(&mut settings.zenoh_user, self.zenoh_user);
+        set_optional(&mut settings.zenoh_password_file, self.zenoh_password_file);
+        set(&mut settings.zenoh_trust_router, self.zenoh_trust_router);
         set(&mut settings.max_message_bytes, self.max_message_bytes);
         set(&mut settings.max_detections, self.max_detections);
         set(&mut settings.max_points_per_detection, self.max_points_per_detection);

@@ -15,21 +15,24 @@
 //! 4. `closed{code, message}` is the last message of a stream, whatever ended it: 0 after `ended`, 10 ABORTED where a
 //!    newer stream of the drive took over, 14 UNAVAILABLE where the server shuts down or knows no such stream (it was
 //!    started anew), 8 `RESOURCE_EXHAUSTED` where more was sent than may be in flight, 15 `DATA_LOSS` where a message did
-//!    not arrive, 7 `PERMISSION_DENIED` where `SessionStart` names another vehicle than the key, 9 `FAILED_PRECONDITION`
+//!    not arrive, 16 UNAUTHENTICATED where a token is missing, wrong or has run out, 7 `PERMISSION_DENIED` where `SessionStart` names another vehicle than the key, 9 `FAILED_PRECONDITION`
 //!    where the stream has no liveliness token, 3 `INVALID_ARGUMENT` for what is no message. Whatever was not acked is
 //!    sent again on a new stream.
 //! 5. A message whose attachment cannot be read is answered by `closed` with nonce 0.
 //! 6. When the vehicle's token goes, its stream is closed as a broken gRPC stream is. While the server takes
 //!    observations it holds the token `lanemap/v1/@server`.
 //!
+//! Who may use which keys, and how a token travels, stands in [`access`].
+//!
 //! Callbacks of zenoh never wait: they put into bounded queues. What publishes may wait for a slow vehicle, and does so
 //! beside the runtime's workers, one stream at a time.
 
-use std::{sync::Arc, time::Duration};
+use std::{future::IntoFuture, sync::Arc, time::Duration};
 
 use lanemap_proto::zenoh_keys;
 use tokio::time::timeout;
 use tokio_util::task::TaskTracker;
+use tracing::{instrument::WithSubscriber, subscriber::NoSubscriber};
 use zenoh::{
     Session,
     handlers::Callback,
@@ -40,10 +43,15 @@ use zenoh::{
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, RecoveryConfig};
 
 use super::conversation::Conversations;
-use crate::config::ServerConfig;
+use crate::{
+    auth::{Authenticator, reload::CredentialError},
+    config::ServerConfig,
+};
 
+pub mod access;
 mod answers;
 mod inbound;
+mod link_security;
 mod streams;
 mod transport_config;
 mod turned_away;
@@ -70,6 +78,9 @@ pub enum ZenohError {
         /// What zenoh says.
         reason: String,
     },
+    /// A file of names, passwords or certificates cannot be used.
+    #[error(transparent)]
+    Credentials(#[from] CredentialError),
     /// The session cannot be opened, e.g. because the address is taken or no router answers.
     #[error("opening the zenoh session: {0}")]
     Open(String),
@@ -96,11 +107,14 @@ impl ZenohIngest {
     pub(crate) async fn open(
         config: &Arc<ServerConfig>,
         conversations: Conversations,
+        authenticator: Arc<Authenticator>,
         tracked: TaskTracker,
     ) -> Result<Self, ZenohError> {
         let transport = transport_config::transport_config(config)?;
-        let session = zenoh::open(transport).await.map_err(|error| ZenohError::Open(error.to_string()))?;
-        let streams = Arc::new(Streams::new(config, conversations, session.clone(), tracked));
+        // Zenoh logs its configuration while it opens, the password with which it connects included.
+        let opening = zenoh::open(transport).into_future().with_subscriber(NoSubscriber::default());
+        let session = opening.await.map_err(|error| ZenohError::Open(error.to_string()))?;
+        let streams = Arc::new(Streams::new(config, conversations, authenticator, session.clone(), tracked));
         let observations = subscribe_to_observations(&session, Arc::clone(&streams))?;
         let alive = subscribe_to_tokens(&session, streams)?;
         let token = session.liveliness().declare_token(zenoh_keys::SERVER);

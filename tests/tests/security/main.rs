@@ -25,6 +25,7 @@ mod certificates;
 mod readers;
 mod secrets;
 mod settings;
+mod zenoh_access;
 
 /// Longest wait for something that takes milliseconds, or, for files that change, two seconds.
 const PATIENCE: Duration = Duration::from_secs(20);

@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use lanemap_proto::zenoh_keys::{Attachment, StreamNonce, VehicleKey, VehicleKeys};
+use lanemap_proto::zenoh_keys::{Attachment, StreamNonce, VehicleKey, VehicleKeys, parse_with_token};
 use tokio::{runtime::Handle, time::sleep};
 use tokio_util::task::TaskTracker;
 use tonic::{Code, Status};
@@ -19,7 +19,13 @@ use super::{
     inbound::{self, Bounds, InboundSender},
     turned_away::{TurnedAway, Usher},
 };
-use crate::{auth::Peer, config::ServerConfig, ingest::conversation::Conversations, telemetry};
+use crate::{
+    auth::{Authenticator, Peer, VehicleName},
+    config::ServerConfig,
+    error::Error,
+    ingest::conversation::Conversations,
+    telemetry,
+};
 
 /// Time within which a stream's liveliness token must be seen.
 const TOKEN_GRACE: Duration = Duration::from_secs(5);
@@ -28,6 +34,8 @@ const TOKEN_GRACE: Duration = Duration::from_secs(5);
 pub(super) struct Streams {
     open: Arc<Mutex<Table>>,
     conversations: Conversations,
+    authenticator: Arc<Authenticator>,
+    key_is_proof: bool,
     session: Session,
     usher: Usher,
     bounds: Bounds,
@@ -57,6 +65,7 @@ impl Streams {
     pub(super) fn new(
         config: &ServerConfig,
         conversations: Conversations,
+        authenticator: Arc<Authenticator>,
         session: Session,
         tracked: TaskTracker,
     ) -> Self {
@@ -69,6 +78,8 @@ impl Streams {
         Self {
             open: Arc::default(),
             conversations,
+            authenticator,
+            key_is_proof: config.zenoh_key_is_proof(),
             usher: Usher::start(session.clone()),
             session,
             bounds,
@@ -83,20 +94,26 @@ impl Streams {
         let key = sample.key_expr().as_str();
         // The subscription's key ends so.
         let acks = || format!("{}/acks", key.strip_suffix("/observations").unwrap_or(key));
-        let read = || {
-            let attachment = sample.attachment().map(ZBytes::to_bytes).unwrap_or_default();
-            Attachment::parse(&attachment).map_err(|error| invalid(&error))
+        let attachment = sample.attachment().map(ZBytes::to_bytes).unwrap_or_default();
+        let (attachment, token) = match parse_with_token(&attachment) {
+            Ok(read) => read,
+            Err(error) => {
+                let why = invalid(&error);
+                return self.usher.turn_away(TurnedAway { acks: acks(), nonce: StreamNonce(0), why });
+            }
         };
-        let attachment = match read() {
-            Ok(attachment) => attachment,
-            Err(why) => return self.usher.turn_away(TurnedAway { acks: acks(), nonce: StreamNonce(0), why }),
-        };
-        if let Err(why) = self.pass_on(key, attachment, sample.payload()) {
+        if let Err(why) = self.pass_on(key, attachment, token, sample.payload()) {
             self.usher.turn_away(TurnedAway { acks: acks(), nonce: attachment.nonce, why });
         }
     }
 
-    fn pass_on(&self, key: &str, Attachment { nonce, number }: Attachment, message: &ZBytes) -> Result<(), Status> {
+    fn pass_on(
+        &self,
+        key: &str,
+        Attachment { nonce, number }: Attachment,
+        token: Option<&str>,
+        message: &ZBytes,
+    ) -> Result<(), Status> {
         let mut open = locked(&self.open);
         let room = open.len() < self.most;
         match open.entry(nonce) {
@@ -115,21 +132,32 @@ impl Streams {
             }
             Entry::Vacant(vacant) => {
                 let vehicle = VehicleKey::parse(key).map_err(|error| invalid(&error))?;
+                let peer = self.peer(&vehicle, token)?;
                 let (sender, inbound) = inbound::channel(self.bounds);
                 let stream = Stream { observations: key.to_owned(), next_number: 0, inbound: Some(sender) };
                 vacant.insert(stream).take(number, message);
                 drop(open);
-                self.begin(nonce, &vehicle, inbound);
+                self.begin(nonce, peer, &vehicle, inbound);
                 Ok(())
             }
         }
     }
 
-    fn begin(&self, nonce: StreamNonce, vehicle: &VehicleKey<'_>, inbound: inbound::Inbound) {
+    /// Who puts on the keys of `vehicle`.
+    fn peer(&self, vehicle: &VehicleKey<'_>, token: Option<&str>) -> Result<Peer, Status> {
+        let name = VehicleName::new(&*vehicle.fleet, &*vehicle.vehicle);
+        let peer = self.authenticator.peer_on_key(name, self.key_is_proof, token);
+        peer.map_err(|error| {
+            metrics::counter!(telemetry::CREDENTIALS_REFUSED).increment(1);
+            Error::Unauthenticated(error).into()
+        })
+    }
+
+    fn begin(&self, nonce: StreamNonce, peer: Peer, vehicle: &VehicleKey<'_>, inbound: inbound::Inbound) {
         let _runtime = self.runtime.enter();
         let closing = Closing { open: Arc::clone(&self.open), nonce };
         let keys = VehicleKeys::new(&vehicle.fleet, &vehicle.vehicle);
-        let answers = self.conversations.begin(Peer::of_vehicle(&vehicle.fleet, &vehicle.vehicle), inbound);
+        let answers = self.conversations.begin(peer, inbound);
         let session = self.session.clone();
         self.tracked.spawn(async move {
             let watch = closing.close_without_token(session.clone(), keys.alive(nonce));

@@ -1,8 +1,9 @@
 //! The configuration of the server's zenoh session, made from the server's own settings.
 
+use serde_json::Value;
 use zenoh::Config;
 
-use super::ZenohError;
+use super::{ZenohError, access::AccessRules, link_security::link_security};
 use crate::config::{ServerConfig, ZenohMode};
 
 /// Room for key, attachment and headers of the largest message.
@@ -18,11 +19,12 @@ const WAIT_BEFORE_CLOSE_US: u64 = 1_000_000;
 /// An endpoint or another setting that zenoh does not take.
 pub(super) fn transport_config(settings: &ServerConfig) -> Result<Config, ZenohError> {
     let mut config = Config::default();
+    secure(&mut config, settings)?;
     let mut set = |name: &'static str, value: String| {
         let set = config.insert_json5(name, &value);
         set.map_err(|error| ZenohError::Config { name, value, reason: error.to_string() })
     };
-    let endpoints = |endpoints: &[String]| serde_json::Value::from(endpoints).to_string();
+    let endpoints = |endpoints: &[String]| Value::from(endpoints).to_string();
     let router = settings.zenoh_mode == ZenohMode::Router;
     set("mode", if router { "\"router\"" } else { "\"client\"" }.to_owned())?;
     set("listen/endpoints", if router { endpoints(settings.zenoh_listen.as_slice()) } else { "[]".to_owned() })?;
@@ -44,6 +46,23 @@ pub(super) fn transport_config(settings: &ServerConfig) -> Result<Config, ZenohE
         set(wait, WAIT_BEFORE_CLOSE_US.to_string())?;
     }
     Ok(config)
+}
+
+/// TLS, passwords and access control.
+fn secure(config: &mut Config, settings: &ServerConfig) -> Result<(), ZenohError> {
+    let rules = AccessRules::of_server(settings)?;
+    let mut set = |name: &'static str, value: &Value| {
+        // Neither value nor reason is repeated: a password may stand in either.
+        config.insert_json5(name, &value.to_string()).map_err(|_| ZenohError::Config {
+            name,
+            value: "(not shown)".to_owned(),
+            reason: "zenoh does not take it".to_owned(),
+        })
+    };
+    for (name, value) in link_security(settings, rules.as_ref())? {
+        set(name, &value)?;
+    }
+    rules.map_or(Ok(()), |rules| set("access_control", &rules.to_json()))
 }
 
 #[cfg(test)]

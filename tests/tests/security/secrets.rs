@@ -1,8 +1,9 @@
 //! What no log shows.
 
 use std::{
-    io::{BufRead, BufReader, Read},
+    io::{BufRead, BufReader},
     process::{Child, Command, Stdio},
+    thread::JoinHandle,
 };
 
 use jsonwebtoken::{Algorithm, EncodingKey, Header, encode};
@@ -12,7 +13,10 @@ use lanemap_tests::{
 };
 use reqwest::StatusCode;
 use serde_json::json;
-use tokio::time::timeout;
+use tokio::{
+    sync::mpsc::{UnboundedReceiver, unbounded_channel},
+    time::timeout,
+};
 use tonic::Code;
 
 use super::{PATIENCE, assert_code, upload};
@@ -21,6 +25,9 @@ use super::{PATIENCE, assert_code, upload};
 struct LoggedServer {
     child: Child,
     url: String,
+    /// One for each line that says that credentials could not be read anew.
+    failed_reloads: UnboundedReceiver<()>,
+    log: JoinHandle<String>,
 }
 
 impl LoggedServer {
@@ -33,14 +40,33 @@ impl LoggedServer {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        let (failed, failed_reloads) = unbounded_channel();
+        // Read from the beginning: a log that nobody reads stops the server.
+        let log = std::thread::spawn(move || {
+            let mut log = String::new();
+            for line in stderr.lines() {
+                let line = line.unwrap();
+                if line.contains("credentials were not read anew") {
+                    let _ = failed.send(());
+                }
+                log.push_str(&line);
+                log.push('\n');
+            }
+            log
+        });
         let mut said = String::new();
-        let mut byte = [0];
-        let stdout = child.stdout.as_mut().unwrap();
-        while !said.ends_with('\n') && stdout.read(&mut byte).unwrap() == 1 {
-            said.push(char::from(byte[0]));
-        }
-        let url = said.split([' ', ',']).find(|word| word.starts_with("http")).expect("no URL").to_owned();
-        Self { child, url }
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut said).unwrap();
+        let url = said.split([' ', ',']).find(|word| word.starts_with("http"));
+        let url = url.unwrap_or_else(|| panic!("no URL in {said:?}")).to_owned();
+        Self { child, url, failed_reloads, log }
+    }
+
+    /// Kills the server; gives what it logged.
+    fn kill(mut self) -> String {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.log.join().unwrap()
     }
 }
 
@@ -66,21 +92,6 @@ async fn no_token_key_or_vehicle_shows_in_a_log_however_much_is_logged() {
     .collect();
     let arguments: Vec<_> = arguments.iter().map(String::as_str).collect();
     let mut server = LoggedServer::start(&arguments);
-    let stderr = BufReader::new(server.child.stderr.take().unwrap());
-    let (reloaded, mut reloads) = tokio::sync::mpsc::unbounded_channel();
-    let log = std::thread::spawn(move || {
-        let mut log = String::new();
-        for line in stderr.lines() {
-            let line = line.unwrap();
-            if line.contains("credentials were not read anew") {
-                let _ = reloaded.send(());
-            }
-            log.push_str(&line);
-            log.push('\n');
-        }
-        log
-    });
-
     let header = Header { kid: Some("s".to_owned()), ..Header::new(Algorithm::HS256) };
     let claims = completed(json!({ "fleet": "north", "vehicle": "vehicle-of-secrets", "scope": "ingest read" }));
     let token = encode(&header, &claims, &EncodingKey::from_secret(secret.as_bytes())).unwrap();
@@ -99,11 +110,8 @@ async fn no_token_key_or_vehicle_shows_in_a_log_however_much_is_logged() {
     tls.write("keys.json", &keys.replace(']', ""));
     let pid = server.child.id().to_string();
     assert!(Command::new("kill").args(["-HUP", &pid]).status().unwrap().success());
-    timeout(PATIENCE, reloads.recv()).await.expect("SIGHUP changes nothing");
-    server.child.kill().unwrap();
-    server.child.wait().unwrap();
-
-    let log = log.join().unwrap();
+    timeout(PATIENCE, server.failed_reloads.recv()).await.expect("SIGHUP changes nothing");
+    let log = server.kill();
     assert!(log.lines().count() > 100, "nothing is logged: {log}");
     let signature = token.rsplit('.').next().unwrap();
     let payload = token.split('.').nth(1).unwrap();

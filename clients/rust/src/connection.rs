@@ -97,7 +97,7 @@ impl Task {
                 Outcome::Broken(error) => error,
             };
             let first = self.with.accepted.get().is_none();
-            let renews = error.is_unauthenticated() && self.with.link.may_renew_token() && !first;
+            let renews = error.is_unauthenticated() && self.with.link.may_renew_token();
             if !(error.is_transient() || renews)
                 || (first && !self.with.patient)
                 || self.tries >= self.with.reconnect.max_tries

@@ -12,10 +12,21 @@ pub struct Credentials {
     pub ca: Option<PathBuf>,
     /// The client's own certificate and key, PEM, for a service that asks for one (mTLS).
     pub identity: Option<IdentityFiles>,
-    /// Name in the service's certificate, where it is not the address's host.
+    /// Name in the service's certificate, where it is not the address's host; for gRPC.
     pub server_name: Option<String>,
-    /// What is sent as `authorization: Bearer`.
+    /// A bearer token: sent as `authorization: Bearer`, and over zenoh with a stream's first message.
     pub token: Option<Token>,
+    /// User and password, for zenoh.
+    pub login: Option<Login>,
+}
+
+/// A user of a zenoh router.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Login {
+    /// The user.
+    pub user: String,
+    /// A file that holds the password.
+    pub password_file: PathBuf,
 }
 
 /// A certificate and its key, PEM.
@@ -65,6 +76,14 @@ impl Credentials {
             }
         };
         Ok(Some(token.trim().to_owned()))
+    }
+
+    /// User and password as they are now.
+    pub(crate) async fn login(&self) -> Result<Option<(String, String)>, ClientError> {
+        let Some(Login { user, password_file }) = &self.login else { return Ok(None) };
+        let bytes = read(password_file.clone(), "password").await?;
+        let text = String::from_utf8(bytes).map_err(|_| credentials(password_file, "the password is not text"))?;
+        Ok(Some((user.clone(), text.trim_end_matches(['\r', '\n']).to_owned())))
     }
 
     /// Whether the token may be another one at the next connection.

@@ -47,7 +47,7 @@ mod session;
 mod spool;
 mod start;
 
-pub use credentials::{Credentials, IdentityFiles, Token};
+pub use credentials::{Credentials, IdentityFiles, Login, Token};
 pub use error::ClientError;
 pub use event::{Event, Events, LocalMap, VehiclePose};
 pub use lanemap_proto::v1::{Refusal, RefusalReason};

@@ -93,7 +93,7 @@ impl Link {
     pub(crate) fn may_renew_token(&self) -> bool {
         match self {
             Self::Grpc(link) => link.may_renew_token(),
-            Self::Zenoh(_) => false,
+            Self::Zenoh(link) => link.may_renew_token(),
         }
     }
 }

@@ -1,12 +1,19 @@
 //! Reads maps over HTTP.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use lanemap_core::LaneMap;
 use lanemap_proto::{decode, v1};
 use prost::Message;
+use rustls::{
+    ClientConfig, RootCertStore,
+    pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
+};
 
-use crate::error::{ClientError, with_sources};
+use crate::{
+    credentials::{Credentials, Tls},
+    error::{ClientError, with_sources},
+};
 
 /// Longest wait for a map.
 const TIMEOUT: Duration = Duration::from_secs(30);
@@ -16,15 +23,30 @@ const TIMEOUT: Duration = Duration::from_secs(30);
 pub struct MapClient {
     base: String,
     http: reqwest::Client,
+    credentials: Credentials,
 }
 
 impl MapClient {
     /// A reader of the service at `url`, e.g. `http://127.0.0.1:8080`.
     #[must_use]
     pub fn new(url: impl Into<String>) -> Self {
-        // Somebody in the process must name the cryptography; where an owner has, that one counts.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        Self { base: url.into().trim_end_matches('/').to_owned(), http: reqwest::Client::new() }
+        name_cryptography();
+        Self { base: base(&url.into()), http: reqwest::Client::new(), credentials: Credentials::default() }
+    }
+
+    /// A reader of a service that asks who reads, or that shows a certificate, e.g. at `https://lanemap.example`.
+    ///
+    /// # Errors
+    /// Certificates that cannot be read.
+    pub async fn with(url: impl Into<String>, credentials: &Credentials) -> Result<Self, ClientError> {
+        let url = url.into();
+        name_cryptography();
+        let mut http = reqwest::Client::builder();
+        if url.starts_with("https") {
+            http = http.tls_backend_preconfigured(client_config(&credentials.tls(&url).await?)?);
+        }
+        let http = http.build().map_err(|error| ClientError::Credentials(with_sources(&error)))?;
+        Ok(Self { base: base(&url), http, credentials: credentials.clone() })
     }
 
     /// The newest map of a session, as the wire has it: with the vehicle's pose and the map's place on the earth.
@@ -47,7 +69,11 @@ impl MapClient {
     async fn get(&self, path: &str) -> Result<Vec<u8>, ClientError> {
         let url = format!("{}{path}", self.base);
         let unreachable = |error: reqwest::Error| ClientError::Unreachable(with_sources(&error));
-        let response = self.http.get(&url).timeout(TIMEOUT).send().await.map_err(unreachable)?;
+        let mut request = self.http.get(&url).timeout(TIMEOUT);
+        if let Some(token) = self.credentials.bearer().await? {
+            request = request.bearer_auth(token);
+        }
+        let response = request.send().await.map_err(unreachable)?;
         let status = response.status();
         let body = response.bytes().await.map_err(unreachable)?;
         if status.is_success() {
@@ -57,4 +83,36 @@ impl MapClient {
         let detail = problem["detail"].as_str().unwrap_or("no detail").to_owned();
         Err(ClientError::Http { url, status: status.as_u16(), detail })
     }
+}
+
+fn base(url: &str) -> String {
+    url.trim_end_matches('/').to_owned()
+}
+
+/// Somebody in the process must name the cryptography of HTTP; where an owner has, that one counts.
+fn name_cryptography() {
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
+/// TLS as the credentials say.
+fn client_config(tls: &Tls) -> Result<ClientConfig, ClientError> {
+    let refused = |what: &str, error: &dyn std::error::Error| {
+        ClientError::Credentials(format!("the {what} cannot be used: {}", with_sources(error)))
+    };
+    let certificates = |what: &'static str, pem: &[u8]| {
+        let read: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
+        read.map_err(|error| refused(what, &error))
+    };
+    let mut roots = RootCertStore::empty();
+    for certificate in certificates("ca", &tls.ca)? {
+        roots.add(certificate).map_err(|error| refused("ca", &error))?;
+    }
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let builder = ClientConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .map_err(|error| refused("cryptography", &error))?
+        .with_root_certificates(roots);
+    let Some((cert, key)) = &tls.identity else { return Ok(builder.with_no_client_auth()) };
+    let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| refused("key", &error))?;
+    builder.with_client_auth_cert(certificates("cert", cert)?, key).map_err(|error| refused("cert", &error))
 }

@@ -11,7 +11,7 @@ use std::{
 
 use lanemap_proto::{
     v1::{self, stream_observations_request::Message as Request, stream_observations_response::Message as Response},
-    zenoh_keys::{Attachment, REQUEST_ENCODING, SERVER, StreamNonce, VehicleKeys},
+    zenoh_keys::{Attachment, REQUEST_ENCODING, SERVER, StreamNonce, VehicleKeys, attachment_with_token},
 };
 use prost::Message;
 use tokio::sync::mpsc;
@@ -30,7 +30,7 @@ use zenoh_ext::{
 };
 
 use super::ConnectOptions;
-use crate::{backlog::on_blocking_thread, error::ClientError};
+use crate::{backlog::on_blocking_thread, credentials::Credentials, error::ClientError};
 
 /// Answers that may wait to be taken. Poses beyond are dropped; anything else beyond ends the stream.
 const ANSWERS: usize = 4096;
@@ -48,6 +48,7 @@ pub(super) const ACCEPTED_WITHIN: Duration = Duration::from_secs(5);
 pub(crate) struct ZenohLink {
     endpoint: String,
     config: Config,
+    credentials: Credentials,
 }
 
 /// What is heard on one stream, and what must live as long as it.
@@ -69,12 +70,15 @@ struct Sender {
     publisher: AdvancedPublisher<'static>,
     alive: LivelinessToken,
     nonce: StreamNonce,
+    /// Shown with the first message.
+    token: Option<String>,
     next: u64,
 }
 
 impl ZenohLink {
     pub(crate) fn new(endpoint: &str, options: &ConnectOptions) -> Result<Self, ClientError> {
-        Ok(Self { endpoint: endpoint.to_owned(), config: config(endpoint, options)? })
+        let credentials = options.credentials.clone();
+        Ok(Self { endpoint: endpoint.to_owned(), config: config(endpoint, options)?, credentials })
     }
 
     /// Asks whether there is a router at the address.
@@ -86,8 +90,19 @@ impl ZenohLink {
     }
 
     async fn open(&self) -> Result<Session, ClientError> {
+        let mut config = self.config.clone();
+        if let Some((user, password)) = self.credentials.login().await? {
+            let login = serde_json::json!({ "user": user, "password": password }).to_string();
+            // The message could hold the password.
+            let refused = |_| ClientError::Credentials("zenoh does not take this user and password".to_owned());
+            config.insert_json5("transport/auth/usrpwd", &login).map_err(refused)?;
+        }
         let unreachable = |error| ClientError::Unreachable(format!("{}: {error}", self.endpoint));
-        zenoh::open(self.config.clone()).await.map_err(unreachable)
+        zenoh::open(config).await.map_err(unreachable)
+    }
+
+    pub(crate) fn may_renew_token(&self) -> bool {
+        self.credentials.may_renew()
     }
 
     /// Opens a stream of the drive that `start` names, and sends it and then `messages`.
@@ -100,6 +115,7 @@ impl ZenohLink {
             Some(Request::Start(start)) => VehicleKeys::new(&start.fleet_id, &start.vehicle_id),
             _ => return Err(ClientError::Protocol("a stream begins with its start".to_owned())),
         };
+        let token = self.credentials.bearer().await?;
         let session = self.open().await?;
         // Randomly seeded, as the standard library's hash maps are.
         let nonce = StreamNonce(RandomState::new().hash_one(0));
@@ -107,7 +123,7 @@ impl ZenohLink {
         let failed = |error: zenoh::Error| ClientError::Unreachable(format!("zenoh: {error}"));
         // Answers first: the one to the start must not be missed.
         let open = listen(&session, &keys, nonce, &hear).await.map_err(failed)?;
-        let sender = Sender::declare(&session, &keys, nonce).await.map_err(failed)?;
+        let sender = Sender::declare(&session, &keys, nonce, token).await.map_err(failed)?;
         tokio::spawn(sender.send_all(start, messages, hear));
         Ok(ZenohAnswers { heard, _open: open })
     }
@@ -184,7 +200,12 @@ fn take(sample: &Sample, nonce: StreamNonce, hear: &mpsc::Sender<Result<Response
 }
 
 impl Sender {
-    async fn declare(session: &Session, keys: &VehicleKeys, nonce: StreamNonce) -> zenoh::Result<Self> {
+    async fn declare(
+        session: &Session,
+        keys: &VehicleKeys,
+        nonce: StreamNonce,
+        token: Option<String>,
+    ) -> zenoh::Result<Self> {
         let alive = session.liveliness().declare_token(keys.alive(nonce)).await?;
         let publisher = session
             .declare_publisher(keys.observations())
@@ -195,7 +216,7 @@ impl Sender {
             .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
             .publisher_detection()
             .await?;
-        Ok(Self { publisher, alive, nonce, next: 0 })
+        Ok(Self { publisher, alive, nonce, token, next: 0 })
     }
 
     /// Sends messages until there are no more, and then tells the service so by giving the stream's token up: what was
@@ -232,7 +253,11 @@ impl Sender {
         for message in messages {
             let attachment = Attachment { nonce: self.nonce, number: self.next };
             self.next += 1;
-            self.publisher.put(message.encode_to_vec()).attachment(attachment.to_string()).wait()?;
+            let attachment = match self.token.take() {
+                Some(token) => attachment_with_token(attachment, &token),
+                None => attachment.to_string(),
+            };
+            self.publisher.put(message.encode_to_vec()).attachment(attachment).wait()?;
         }
         Ok(())
     }

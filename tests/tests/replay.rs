@@ -12,8 +12,15 @@ use std::{
 use lanemap_client::MapClient;
 use lanemap_core::{Frame, FrameLimits, LaneMap, Mapper, Params, Preset, Sequence};
 use lanemap_openlane::Drives;
+use lanemap_server::{Server, ServerConfig, config::ZenohMode};
 use lanemap_simulator::{OdometryNoise, Scenario, openlane::write_simulation};
-use lanemap_tests::{folders::files, http, servers};
+use lanemap_tests::{
+    folders::files,
+    http,
+    proxy::{Fault, Proxy},
+    raw_zenoh::free_endpoint,
+    servers,
+};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -80,6 +87,41 @@ async fn a_drive_replayed_over_grpc_gives_the_lanes_and_the_local_maps_of_a_loca
     assert_eq!(served, mapped(drives.path()));
     assert_eq!(report(&local)["drives"][0]["lanes"], served.lanes.len());
     assert_eq!(files(here.path()), files(there.path()));
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drive_replayed_over_zenoh_gives_the_map_of_a_local_replay() {
+    let drives = recorded(11, 1, 300.0);
+    let store = tempfile::tempdir().unwrap();
+    let zenoh = free_endpoint();
+    let config = ServerConfig {
+        zenoh_mode: ZenohMode::Router,
+        zenoh_listen: zenoh.parse().unwrap(),
+        ..servers::config(store.path())
+    };
+    let server = Server::start(config).await.unwrap();
+    let output = replay(drives.path(), &["--server", &server.url(), "--transport", "zenoh", "--zenoh", &zenoh]);
+    assert_success(&output);
+    assert_eq!(report(&output)["drives"][0]["session"]["same_as_local"], true);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_connection_that_breaks_in_the_middle_of_a_drive_is_made_anew_and_the_replay_goes_on() {
+    let drives = recorded(12, 2, 300.0);
+    let store = tempfile::tempdir().unwrap();
+    let server = servers::start(store.path()).await;
+    let proxy = Proxy::start(server.address(), 20_000, &[Fault::Cut; 4]).await;
+    let url = format!("http://{}", proxy.address());
+    let folder = drives.path().to_owned();
+    let output = tokio::task::spawn_blocking(move || replay(&folder, &["--server", &url])).await.unwrap();
+    assert_success(&output);
+    let drives = report(&output)["drives"].clone();
+    let sessions: Vec<_> = drives.as_array().unwrap().iter().map(|drive| &drive["session"]).collect();
+    assert!(sessions.iter().all(|session| session["same_as_local"] == true), "{drives}");
+    let reconnections: u64 = sessions.iter().filter_map(|session| session["reconnections"].as_u64()).sum();
+    assert!(reconnections >= 2, "{drives}");
     server.shutdown().await;
 }
 

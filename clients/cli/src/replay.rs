@@ -9,6 +9,7 @@ mod progress;
 mod rate;
 mod report;
 mod results;
+mod server;
 mod step_times;
 mod stream;
 
@@ -26,6 +27,7 @@ use progress::Progress;
 use rate::{Pacer, Rate};
 use report::{DriveReport, ReplayReport};
 use results::ResultWriter;
+use server::ServerArgs;
 use stream::{ServerLink, StreamedDrive};
 
 /// What to replay, how, and where to.
@@ -48,9 +50,8 @@ pub struct ReplayArgs {
     /// How fast: 1 is as recorded, 10 ten times faster, max as fast as frames are taken
     #[arg(long, value_name = "1|max", default_value = "max")]
     rate: Rate,
-    /// The server to stream to
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
-    server: String,
+    #[command(flatten)]
+    server: ServerArgs,
     /// Run the mapper in this process only; no server is needed
     #[arg(long, conflicts_with = "server")]
     local: bool,
@@ -91,7 +92,8 @@ impl From<PresetArg> for Preset {
 
 /// Replays the drives one after the other. Frames that cannot be read or are not valid are left out, named on stderr and
 /// in the report, and make the exit code 1, as do frames that the server refuses and a map of the server that is not the
-/// one made here; the rest is replayed.
+/// one made here; the rest is replayed. A connection that breaks is made anew; a drive whose connection stays broken is
+/// reported, and the next one begins.
 #[tokio::main]
 pub async fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let mut drives = args.recordings.open().context("no drives to replay")?;
@@ -130,19 +132,19 @@ async fn replay_drive(
     for prepared in source.by_ref() {
         let run = match &mut run {
             Some(run) => run,
-            None => run.insert(DriveRun::start(args.preset, &name, &prepared, server).await?),
+            None => run.insert(DriveRun::start(args.preset, &name, &prepared, server).await),
         };
         let due = pacer.wait_for(prepared.frame.time()).await;
         if let Some(recorder) = &mut recorder {
             recorder.take(&prepared)?;
         }
-        run.take(&prepared, results.as_ref()).await?;
+        run.take(&name, &prepared, results.as_ref()).await?;
         progress.stepped(run.mapper.lanes(), run.unacked, due.elapsed());
     }
     let faults = source.into_faults();
     recorder.map(DriveRecorder::finish).transpose()?;
     match run {
-        Some(run) => run.finish(&name, faults).await,
+        Some(run) => Ok(run.finish(&name, faults).await),
         None => Ok(DriveReport::new(&name, None, faults, None)),
     }
 }
@@ -151,29 +153,39 @@ async fn replay_drive(
 struct DriveRun<'a> {
     mapper: MapperRun,
     stream: Option<StreamedDrive<'a>>,
+    /// Why it is not streamed any more.
+    failure: Option<String>,
     unacked: u64,
 }
 
 impl<'a> DriveRun<'a> {
-    async fn start(
-        preset: PresetArg,
-        name: &str,
-        first: &PreparedFrame,
-        server: Option<&'a ServerLink>,
-    ) -> anyhow::Result<Self> {
+    async fn start(preset: PresetArg, name: &str, first: &PreparedFrame, server: Option<&'a ServerLink>) -> Self {
         let sensor = first.camera.sensor;
-        let stream = match server {
-            Some(link) => Some(link.open(name, preset.into(), sensor).await?),
+        let opened = match server {
+            Some(link) => Some(link.open(name, preset.into(), sensor).await),
             None => None,
         };
-        Ok(Self { mapper: MapperRun::new(Params::preset(preset.into()), sensor), stream, unacked: 0 })
+        let mapper = MapperRun::new(Params::preset(preset.into()), sensor);
+        let mut run = Self { mapper, stream: None, failure: None, unacked: 0 };
+        match opened.transpose() {
+            Ok(stream) => run.stream = stream,
+            Err(error) => run.fail(name, &error),
+        }
+        run
     }
 
-    async fn take(&mut self, prepared: &PreparedFrame, results: Option<&ResultWriter<'_>>) -> anyhow::Result<()> {
+    async fn take(
+        &mut self,
+        name: &str,
+        prepared: &PreparedFrame,
+        results: Option<&ResultWriter<'_>>,
+    ) -> anyhow::Result<()> {
         let PreparedFrame { frame, recorded_pose, camera } = prepared;
         if let Some(stream) = &mut self.stream {
-            stream.send(frame).await?;
-            self.unacked = stream.unacked_at(frame);
+            match stream.send(frame).await {
+                Ok(()) => self.unacked = stream.unacked_at(frame),
+                Err(error) => self.fail(name, &error),
+            }
         }
         self.mapper.step(frame, recorded_pose);
         match results {
@@ -182,11 +194,21 @@ impl<'a> DriveRun<'a> {
         }
     }
 
-    async fn finish(self, name: &str, faults: Vec<Fault>) -> anyhow::Result<DriveReport> {
-        let session = match self.stream {
-            Some(stream) => Some(stream.finish(&self.mapper.mapper().lane_map()).await?),
-            None => None,
-        };
-        Ok(DriveReport::new(name, Some(&self.mapper), faults, session))
+    /// The drive is not streamed any more; the mapper here goes on.
+    fn fail(&mut self, name: &str, error: &anyhow::Error) {
+        let error = format!("{error:#}");
+        tracing::error!("{name}: {error}");
+        (self.stream, self.failure, self.unacked) = (None, Some(error), 0);
+    }
+
+    async fn finish(mut self, name: &str, faults: Vec<Fault>) -> DriveReport {
+        let mut session = None;
+        if let Some(stream) = self.stream.take() {
+            match stream.finish(&self.mapper.mapper().lane_map()).await {
+                Ok(report) => session = Some(report),
+                Err(error) => self.fail(name, &error),
+            }
+        }
+        DriveReport::new(name, Some(&self.mapper), faults, session).failed(self.failure)
     }
 }

@@ -44,6 +44,9 @@ pub struct DriveReport {
     /// What became of it at the server; absent with `--local`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub session: Option<SessionReport>,
+    /// Why it was not streamed to its end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
     #[serde(skip)]
     times: StepTimes,
 }
@@ -61,14 +64,20 @@ impl DriveReport {
             step_us_per_km: times.means_per_km_us(),
             left_out,
             session,
+            failure: None,
             times,
         }
+    }
+
+    /// The same, of a drive that was not streamed to its end.
+    pub fn failed(self, failure: Option<String>) -> Self {
+        Self { failure, ..self }
     }
 
     /// Whether every frame was replayed, taken by the server, and mapped there as here.
     fn is_whole(&self) -> bool {
         let served = self.session.as_ref().is_none_or(|session| session.refused == 0 && session.same_as_local);
-        self.left_out.is_empty() && served
+        self.left_out.is_empty() && self.failure.is_none() && served
     }
 }
 
@@ -95,6 +104,9 @@ impl fmt::Display for ReplayReport {
         for drive in &self.drives {
             let DriveReport { name, frames, length_m, lanes, left_out, .. } = drive;
             writeln!(out, "{name:<34} {frames:>7} {length_m:>9.1} {lanes:>6} {:>9}", left_out.len())?;
+            if let Some(failure) = &drive.failure {
+                writeln!(out, "  not streamed to its end: {failure}")?;
+            }
             if let Some(session) = &drive.session {
                 write!(out, "  {}", session.lanes_url)?;
                 match (session.refused, session.same_as_local) {

@@ -11,12 +11,16 @@ use lanemap_core::{Frame, LaneMap, Preset, Sensor};
 use serde::Serialize;
 use tokio::task::JoinHandle;
 
+use super::server::ServerArgs;
+
 /// Refusals kept word by word; all of them are counted.
 const MAX_REFUSALS: usize = 100;
 
 /// A server to which drives are streamed.
 pub struct ServerLink {
     url: String,
+    fleet: String,
+    vehicle: Option<String>,
     ingest: IngestClient,
     maps: MapClient,
 }
@@ -50,20 +54,27 @@ pub struct SessionReport {
 
 impl ServerLink {
     /// Connects to a server.
-    pub async fn connect(url: &str) -> anyhow::Result<Self> {
-        let ingest = IngestClient::connect(url)
-            .await
-            .with_context(|| format!("no server at {url}; start one with lanemap serve, or replay with --local"))?;
-        let url = url.trim_end_matches('/').to_owned();
-        Ok(Self { maps: MapClient::new(url.as_str()), ingest, url })
+    pub async fn connect(server: &ServerArgs) -> anyhow::Result<Self> {
+        let (ingest_url, options) = (server.ingest_url(), server.connect_options());
+        let maps = MapClient::with(server.url.as_str(), &options.credentials).await?;
+        let ingest = IngestClient::connect_with(ingest_url, options).await.with_context(|| {
+            format!("no server at {ingest_url}; start one with lanemap serve, or replay with --local")
+        })?;
+        let url = server.url.trim_end_matches('/').to_owned();
+        Ok(Self { maps, ingest, url, fleet: server.fleet.clone(), vehicle: server.vehicle.clone() })
     }
 
     /// Opens a session of its own for a drive: a drive replayed twice is two drives.
     pub async fn open(&self, drive: &str, preset: Preset, sensor: Sensor) -> anyhow::Result<StreamedDrive<'_>> {
         let now_ms = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
-        let start = SessionStart { preset, sensor, ..SessionStart::new("replay", drive, format!("{now_ms}")) };
-        let (session, events) =
-            self.ingest.start_session(start).await.with_context(|| format!("{drive}: no session"))?;
+        let (vehicle, drive_id) = match &self.vehicle {
+            Some(vehicle) => (vehicle.as_str(), format!("{drive}-{now_ms}")),
+            None => (drive, now_ms.to_string()),
+        };
+        let start = SessionStart { preset, sensor, ..SessionStart::new(&self.fleet, vehicle, drive_id) };
+        let no_session = || format!("{drive}: no session");
+        let (mut session, events) = self.ingest.begin_session(start).await.with_context(no_session)?;
+        session.wait_opened().await.with_context(no_session)?;
         let refusals = Arc::new(Mutex::new(Vec::new()));
         let listener = tokio::spawn(collect_refusals(events, Arc::clone(&refusals)));
         Ok(StreamedDrive { link: self, session, refusals, listener })

@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 
 import grpc
 from google.protobuf import duration_pb2
+from google.protobuf.message import DecodeError
 
 from ._link import Credentials, Link, Stream
 from .errors import StreamBroken
@@ -61,7 +62,9 @@ class GrpcLink(Link):
             request_serializer=_as_it_is,
             response_deserializer=ingest_service_pb2.StreamObservationsResponse.FromString,
         )
-        return _GrpcStream(channel, method(requests, metadata=metadata))
+        # A token that is not believed may be another one by the next stream.
+        renewed = {grpc.StatusCode.UNAUTHENTICATED} if self._credentials.token_file is not None else set()
+        return _GrpcStream(channel, method(requests, metadata=metadata), TRANSIENT | renewed)
 
     def close(self) -> None:
         pass
@@ -76,8 +79,8 @@ class _Call(Protocol):
 
 
 class _GrpcStream(Stream):
-    def __init__(self, channel: grpc.Channel, call: object) -> None:
-        self._channel, self._call = channel, cast(_Call, call)
+    def __init__(self, channel: grpc.Channel, call: object, transient: set[grpc.StatusCode]) -> None:
+        self._channel, self._call, self._transient = channel, cast(_Call, call), transient
 
     def answer(self) -> ingest_service_pb2.StreamObservationsResponse | None:
         try:
@@ -85,7 +88,7 @@ class _GrpcStream(Stream):
         except StopIteration:
             return None
         except grpc.RpcError as error:
-            raise _broken(error) from error
+            raise _broken(error, self._transient) from error
 
     def cancel(self) -> None:
         self._call.cancel()
@@ -103,12 +106,12 @@ def _channel_credentials(credentials: Credentials) -> grpc.ChannelCredentials:
     return grpc.ssl_channel_credentials(read(credentials.ca), read(credentials.key), read(credentials.cert))
 
 
-def _broken(error: grpc.RpcError) -> StreamBroken:
+def _broken(error: grpc.RpcError, transient: set[grpc.StatusCode]) -> StreamBroken:
     if not isinstance(error, grpc.Call):
         return StreamBroken(str(error), transient=True)
     code, details = error.code(), error.details()
     return StreamBroken(
-        f"{details} ({code.name})", transient=code in TRANSIENT, retry_after_s=_retry_after_s(error)
+        f"{details} ({code.name})", transient=code in transient, retry_after_s=_retry_after_s(error)
     )
 
 
@@ -123,7 +126,10 @@ def _retry_after_s(call: grpc.Call) -> float | None:
                 packed = _fields(detail)
                 if packed.get(1, [b""])[0].endswith(b"/google.rpc.RetryInfo"):
                     for retry_delay in _fields(packed.get(2, [b""])[0]).get(1, []):
-                        delay = duration_pb2.Duration.FromString(retry_delay)
+                        try:
+                            delay = duration_pb2.Duration.FromString(retry_delay)
+                        except DecodeError:
+                            return None
                         return delay.seconds + delay.nanos * 1e-9
     return None
 
@@ -149,6 +155,8 @@ def _fields(message: bytes) -> dict[int, list[bytes]]:
         tag = varint()
         if tag & 7 == 2:
             length = varint()
+            if at + length > len(message):
+                break
             fields.setdefault(tag >> 3, []).append(message[at : at + length])
             at += length
         elif tag & 7 == 0:

@@ -13,19 +13,24 @@ from .v1 import ingest_service_pb2
 
 @dataclass(frozen=True)
 class Credentials:
-    """TLS and token: paths of PEM files, and a bearer token or a file that holds it, read for every stream."""
+    """Who the client is and whom it trusts: paths of PEM files; a bearer token, or a file that holds it, read for every
+    stream; and for zenoh a user name with a file that holds its password, read likewise."""
 
     ca: str | os.PathLike[str] | None = None
     cert: str | os.PathLike[str] | None = None
     key: str | os.PathLike[str] | None = None
     token: str | None = None
     token_file: str | os.PathLike[str] | None = None
+    user: str | None = None
+    password_file: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         if (self.cert is None) != (self.key is None):
             raise ValueError("cert and key: one is missing, limit: both or neither")
         if self.token is not None and self.token_file is not None:
             raise ValueError("token and token_file are both given, limit: at most one")
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user and password_file: one is missing, limit: both or neither")
 
     def bearer(self) -> str | None:
         """The token as it is now."""

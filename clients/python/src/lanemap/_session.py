@@ -137,7 +137,8 @@ class Session:
     `fleet`, `vehicle` and `drive` together name the drive: the same names resume it. Without a spool the session waits
     until the service has accepted it, keeps `max_unacked` frames in memory to be sent again, and `send` waits while so
     many are unacked. With a spool (a folder, or `SpoolOptions`) frames wait on disk: the session begins without a
-    service too, outlives the process, and resumes after it.
+    service too, outlives the process, and resumes after it. A drive that was begun with a spool is to be resumed with it:
+    it knows which numbers its frames have.
 
     As a context, the session ends the drive (`finish`) where the block ends well, and leaves it as it is where the
     block raises.

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import IO, Literal
 from urllib.parse import quote
 
+from google.protobuf.message import DecodeError
+
 from . import _records
 from ._records import HEADER, MAGIC, Kind
 from .errors import SpoolError, SpoolFull
@@ -237,11 +239,17 @@ class Spool:
         if record.kind == Kind.END:
             self.ended = True
         elif record.kind == Kind.MARK:
-            (mark,) = struct.unpack("<Q", record.body)
-            self._mark(mark)
+            if len(record.body) == 8:
+                self._mark(*struct.unpack("<Q", record.body))
+            else:
+                self.recovery.damaged_bytes += record.length
         elif record.kind == Kind.FRAME:
-            message = observation_pb2.Frame.FromString(record.body)
-            self._note(segment, message.sequence, record.offset, record.length)
+            try:
+                message = observation_pb2.Frame.FromString(record.body)
+            except DecodeError:
+                self.recovery.damaged_bytes += record.length
+            else:
+                self._note(segment, message.sequence, record.offset, record.length)
 
     def _note(self, segment: _Segment, sequence: int, offset: int, length: int) -> None:
         segment.unresolved += 1

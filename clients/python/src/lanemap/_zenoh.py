@@ -11,6 +11,7 @@ import queue
 import secrets
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from urllib.parse import quote
 
 import zenoh
@@ -30,6 +31,7 @@ MAX_UPDATES = 1024
 # exhausted, failed precondition (the stream's token came late), internal, unavailable, data loss (a message did not
 # arrive).
 TRANSIENT = {1, 2, 4, 8, 9, 13, 14, 15}
+UNAUTHENTICATED = 16
 
 
 class ZenohLink(Link):
@@ -44,8 +46,9 @@ class ZenohLink(Link):
         self._config()  # What is wrong with it is said now.
 
     def open(self, requests: Iterator[bytes]) -> Stream:
+        token, renewed = self._credentials.bearer(), self._credentials.token_file is not None
         try:
-            return _ZenohStream(zenoh.open(self._config()), self._vehicle, requests)
+            return _ZenohStream(zenoh.open(self._config()), self._vehicle, requests, token, renewed)
         except zenoh.ZError as error:
             raise StreamBroken(f"{self._endpoint}: {error}", transient=True) from error
 
@@ -58,9 +61,11 @@ class ZenohLink(Link):
             "connect/endpoints": [self._endpoint],
             "connect/timeout_ms": 10_000,
             "scouting/multicast/enabled": False,
-            "timestamping/enabled": True,
             "transport/link/tx/lease": max(100, int(self._keep_alive_s * 1000)),
         }
+        if self._credentials.user is not None and self._credentials.password_file is not None:
+            settings["transport/auth/usrpwd/user"] = self._credentials.user
+            settings["transport/auth/usrpwd/password"] = Path(self._credentials.password_file).read_text().rstrip("\r\n")
         if self._endpoint.startswith("tls/"):
             tls = self._credentials
             if tls.ca is None:
@@ -77,8 +82,13 @@ class ZenohLink(Link):
 
 
 class _ZenohStream(Stream):
-    def __init__(self, session: zenoh.Session, vehicle: str, requests: Iterator[bytes]) -> None:
+    def __init__(
+        self, session: zenoh.Session, vehicle: str, requests: Iterator[bytes], token: str | None, renewed: bool
+    ) -> None:
         self._session = session
+        self._token = token
+        # A token that is not believed may be another one by the next stream.
+        self._transient = TRANSIENT | {UNAUTHENTICATED} if renewed else TRANSIENT
         self._nonce = secrets.token_hex(8)
         self._answers: queue.SimpleQueue[ingest.StreamObservationsResponse | StreamBroken] = queue.SimpleQueue()
         self._accepted = False
@@ -120,7 +130,7 @@ class _ZenohStream(Stream):
             if closed.code == 0:
                 return None
             retry_after_s = closed.retry_after_ms * 1e-3 if closed.HasField("retry_after_ms") else None
-            raise StreamBroken(closed.message, transient=closed.code in TRANSIENT, retry_after_s=retry_after_s)
+            raise StreamBroken(closed.message, transient=closed.code in self._transient, retry_after_s=retry_after_s)
         self._accepted = True
         return answer
 
@@ -132,7 +142,10 @@ class _ZenohStream(Stream):
     def _send(self, requests: Iterator[bytes]) -> None:
         try:
             for number, request in enumerate(requests):
-                self._publisher.put(request, attachment=f"{self._nonce}{number:016x}")
+                attachment = f"{self._nonce}{number:016x}"
+                if number == 0 and self._token is not None:
+                    attachment += f" {self._token}"
+                self._publisher.put(request, attachment=attachment)
             # No more is sent; what was sent is still answered, and then the stream is closed.
             self._alive.undeclare()  # type: ignore[no-untyped-call]
         except zenoh.ZError as error:

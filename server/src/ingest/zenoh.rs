@@ -8,16 +8,19 @@
 //!    its nonce comes back in time, it begins anew with another nonce.
 //! 2. It puts frames, then `SessionEnd`, as messages 1, 2, 3 and so on, at most `max_frames_in_flight` of them unacked.
 //!    `CongestionControl::Block` and `Reliability::Reliable`; zenoh-ext's `AdvancedPublisher` with a cache of that many
-//!    samples and `sample_miss_detection` lets the server fetch what the transport lost.
+//!    samples and `sample_miss_detection` lets the server fetch what the transport lost. A publisher that does not number
+//!    its samples so should not go through a router that stamps them with its time: zenoh-ext would go by the stamps of
+//!    that router, whose order several vehicles can break, and drop what comes late.
 //! 3. The server puts `accepted`, `ack`, `refusal` and `ended` on `.../acks`, `pose` and `local_map` on `.../pose`, each
 //!    with the stream's nonce and a running number of its own per key. Acks are cumulative; poses may be dropped where
 //!    the vehicle is slow. `.../acks` is an `AdvancedPublisher` too: subscribe with recovery, and nothing is missed.
 //! 4. `closed{code, message}` is the last message of a stream, whatever ended it: 0 after `ended`, 10 ABORTED where a
 //!    newer stream of the drive took over, 14 UNAVAILABLE where the server shuts down or knows no such stream (it was
 //!    started anew), 8 `RESOURCE_EXHAUSTED` where more was sent than may be in flight, 15 `DATA_LOSS` where a message did
-//!    not arrive, 16 UNAUTHENTICATED where a token is missing, wrong or has run out, 7 `PERMISSION_DENIED` where `SessionStart` names another vehicle than the key, 9 `FAILED_PRECONDITION`
-//!    where the stream has no liveliness token, 3 `INVALID_ARGUMENT` for what is no message. Whatever was not acked is
-//!    sent again on a new stream.
+//!    not arrive, 16 UNAUTHENTICATED where a bearer token is missing, wrong or has run out, 7 `PERMISSION_DENIED` where
+//!    `SessionStart` names another vehicle than the key, 9 `FAILED_PRECONDITION` where the stream has no liveliness token,
+//!    3 `INVALID_ARGUMENT` for what is no message, 6 `ALREADY_EXISTS` where another vehicle's stream has the nonce.
+//!    Whatever was not acked is sent again on a new stream.
 //! 5. A message whose attachment cannot be read is answered by `closed` with nonce 0.
 //! 6. When the vehicle's token goes, its stream is closed as a broken gRPC stream is. While the server takes
 //!    observations it holds the token `lanemap/v1/@server`.
@@ -45,7 +48,7 @@ use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, RecoveryConfig
 use super::conversation::Conversations;
 use crate::{
     auth::{Authenticator, reload::CredentialError},
-    config::ServerConfig,
+    config::{ServerConfig, ZenohMode},
 };
 
 pub mod access;
@@ -119,6 +122,11 @@ impl ZenohIngest {
         let alive = subscribe_to_tokens(&session, streams)?;
         let token = session.liveliness().declare_token(zenoh_keys::SERVER);
         let server = token.await.map_err(declaring("the server's token"))?;
+        let (mode, listen, connect) = (config.zenoh_mode, &config.zenoh_listen, &config.zenoh_connect);
+        match mode {
+            ZenohMode::Router => tracing::info!(%mode, %listen, "taking observations over zenoh"),
+            ZenohMode::Client | ZenohMode::Off => tracing::info!(%mode, %connect, "taking observations over zenoh"),
+        }
         Ok(Self { session, _observations: observations, _alive: alive, _server: server })
     }
 

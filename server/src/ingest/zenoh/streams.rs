@@ -16,11 +16,11 @@ use zenoh::{Session, bytes::ZBytes, sample::Sample};
 
 use super::{
     answers,
-    inbound::{self, Bounds, InboundSender},
+    inbound::{self, Bounds, Inbound, InboundSender},
     turned_away::{TurnedAway, Usher},
 };
 use crate::{
-    auth::{Authenticator, Peer, VehicleName},
+    auth::{Authenticator, VehicleName},
     config::ServerConfig,
     error::Error,
     ingest::conversation::Conversations,
@@ -132,40 +132,40 @@ impl Streams {
             }
             Entry::Vacant(vacant) => {
                 let vehicle = VehicleKey::parse(key).map_err(|error| invalid(&error))?;
-                let peer = self.peer(&vehicle, token)?;
+                let vehicle = VehicleName::new(vehicle.fleet, vehicle.vehicle);
                 let (sender, inbound) = inbound::channel(self.bounds);
                 let stream = Stream { observations: key.to_owned(), next_number: 0, inbound: Some(sender) };
                 vacant.insert(stream).take(number, message);
                 drop(open);
-                self.begin(nonce, peer, &vehicle, inbound);
+                self.begin(nonce, vehicle, token.map(str::to_owned), inbound);
                 Ok(())
             }
         }
     }
 
-    /// Who puts on the keys of `vehicle`.
-    fn peer(&self, vehicle: &VehicleKey<'_>, token: Option<&str>) -> Result<Peer, Status> {
-        let name = VehicleName::new(&*vehicle.fleet, &*vehicle.vehicle);
-        let peer = self.authenticator.peer_on_key(name, self.key_is_proof, token);
-        peer.map_err(|error| {
-            metrics::counter!(telemetry::CREDENTIALS_REFUSED).increment(1);
-            Error::Unauthenticated(error).into()
-        })
-    }
-
-    fn begin(&self, nonce: StreamNonce, peer: Peer, vehicle: &VehicleKey<'_>, inbound: inbound::Inbound) {
-        let _runtime = self.runtime.enter();
+    /// Begins a stream in a task of its own, which also checks the token: that takes longer than a callback may.
+    fn begin(&self, nonce: StreamNonce, vehicle: VehicleName, token: Option<String>, inbound: Inbound) {
         let closing = Closing { open: Arc::clone(&self.open), nonce };
         let keys = VehicleKeys::new(&vehicle.fleet, &vehicle.vehicle);
-        let answers = self.conversations.begin(peer, inbound);
-        let session = self.session.clone();
-        self.tracked.spawn(async move {
+        let (authenticator, key_is_proof) = (Arc::clone(&self.authenticator), self.key_is_proof);
+        let (conversations, session, usher) = (self.conversations.clone(), self.session.clone(), self.usher.clone());
+        let stream = async move {
+            let peer = match authenticator.peer_on_key(vehicle, key_is_proof, token.as_deref()) {
+                Ok(peer) => peer,
+                Err(error) => {
+                    metrics::counter!(telemetry::CREDENTIALS_REFUSED).increment(1);
+                    let why = Error::Unauthenticated(error).into();
+                    return usher.turn_away(TurnedAway { acks: keys.acks(), nonce, why });
+                }
+            };
+            let answers = conversations.begin(peer, inbound);
             let watch = closing.close_without_token(session.clone(), keys.alive(nonce));
             tokio::select! {
                 () = answers::publish(session, keys, nonce, answers) => {}
                 () = watch => {}
             }
-        });
+        };
+        self.tracked.spawn_on(stream, &self.runtime);
     }
 
     /// A vehicle's liveliness token is gone: its stream takes what came before, and ends.

@@ -8,7 +8,7 @@ mod grpc;
 mod outbox;
 mod refusal;
 mod upload;
-pub(crate) mod zenoh;
+pub mod zenoh;
 
 pub use grpc::IngestGrpc;
 pub use outbox::{Outbox, OutboxStream};

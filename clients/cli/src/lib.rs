@@ -1,4 +1,4 @@
-//! The `lanemap` command: serve, replay, record, evaluate, bench, simulate, demo.
+//! The `lanemap` command: serve, replay, record, evaluate, bench, simulate, demo, zenoh-access.
 //!
 //! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
 //! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
@@ -18,6 +18,7 @@ mod replay;
 mod serve;
 mod signal;
 mod simulate;
+mod zenoh_access;
 
 /// Streams lane detections into lane maps.
 #[derive(Debug, Parser)]
@@ -45,6 +46,8 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Makes synthetic drives with their truth, as OpenLane folders.
     Simulate(simulate::SimulateArgs),
+    /// Prints the access control of a zenoh router: each vehicle may use its own keys only.
+    ZenohAccess(zenoh_access::ZenohAccessArgs),
 }
 
 /// Runs the command line of this process.
@@ -63,6 +66,7 @@ pub fn run() -> ExitCode {
         Command::Forget(args) => forget::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::ZenohAccess(args) => zenoh_access::run(&args),
     };
     match done {
         Ok(code) => code,

@@ -30,7 +30,7 @@
 //! Callbacks of zenoh never wait: they put into bounded queues. What publishes may wait for a slow vehicle, and does so
 //! beside the runtime's workers, one stream at a time.
 
-use std::{future::IntoFuture, sync::Arc, time::Duration};
+use std::{sync::Arc, time::Duration};
 
 use lanemap_proto::zenoh_keys;
 use tokio::time::timeout;
@@ -114,8 +114,9 @@ impl ZenohIngest {
         tracked: TaskTracker,
     ) -> Result<Self, ZenohError> {
         let transport = transport_config::transport_config(config)?;
-        // Zenoh logs its configuration while it opens, the password with which it connects included.
-        let opening = zenoh::open(transport).into_future().with_subscriber(NoSubscriber::default());
+        // Zenoh logs its configuration while it opens, the password with which it connects included. It opens before
+        // the first poll of what `open` gives: hence a future around it.
+        let opening = async { zenoh::open(transport).await }.with_subscriber(NoSubscriber::default());
         let session = opening.await.map_err(|error| ZenohError::Open(error.to_string()))?;
         let streams = Arc::new(Streams::new(config, conversations, authenticator, session.clone(), tracked));
         let observations = subscribe_to_observations(&session, Arc::clone(&streams))?;

@@ -7,12 +7,15 @@ use std::{
 };
 
 use jsonwebtoken::{Algorithm, EncodingKey, Header, encode};
+use lanemap_proto::v1::SessionStart;
 use lanemap_tests::{
     authorities::TlsFolder,
+    drives,
+    raw_zenoh::{RawZenohStream, configuration, free_endpoint, server_is_there},
     tokens::{self, completed},
 };
 use reqwest::StatusCode;
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::{
     sync::mpsc::{UnboundedReceiver, unbounded_channel},
     time::timeout,
@@ -119,4 +122,57 @@ async fn no_token_key_or_vehicle_shows_in_a_log_however_much_is_logged() {
         let shown = log.lines().find(|line| line.contains(secret));
         assert!(shown.is_none(), "{secret} shows in {shown:?}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_password_of_zenoh_shows_in_a_log_and_printed_rules_let_a_server_serve_through_another_router() {
+    let folder = tempfile::tempdir().unwrap();
+    let tls = TlsFolder::new(folder.path());
+    let authority = tls.write("servers-ca.crt", &tls.servers.pem());
+    let passwords = tls.write("passwords", "map-server:password-of-secrets\nnorth/car-1:first\n");
+    let own = tls.write("own-password", "password-of-secrets\n");
+    let printed = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"))
+        .args(["zenoh-access", "--server", "map-server", "--passwords"])
+        .arg(&passwords)
+        .output()
+        .unwrap();
+    let rules: Value = serde_json::from_slice(&printed.stdout).unwrap();
+    assert!(!rules.to_string().contains("of-secrets"));
+
+    let endpoint = free_endpoint().replace("tcp/127.0.0.1", "tls/localhost");
+    let path = |name: &str| folder.path().join(name);
+    let mut router = configuration("router", &[&endpoint], &[]);
+    let listening = json!({ "listen_certificate": path("server.crt"), "listen_private_key": path("server.key") });
+    router.insert_json5("transport/link/tls", &listening.to_string()).unwrap();
+    router.insert_json5("transport/auth/usrpwd", &json!({ "dictionary_file": passwords }).to_string()).unwrap();
+    router.insert_json5("access_control", &rules["access_control"].to_string()).unwrap();
+    let _router = zenoh::open(router).await.unwrap();
+
+    let text = |path: &std::path::Path| path.to_str().unwrap().to_owned();
+    let arguments = [
+        ("--data-dir", text(&path("data"))),
+        ("--zenoh-mode", "client".to_owned()),
+        ("--zenoh-connect", endpoint.clone()),
+        ("--zenoh-ca-file", text(&authority)),
+        ("--zenoh-user", "map-server".to_owned()),
+        ("--zenoh-password-file", text(&own)),
+        ("--zenoh-trust-router", "true".to_owned()),
+    ];
+    let arguments: Vec<_> = arguments.iter().flat_map(|(flag, value)| [*flag, value.as_str()]).collect();
+    let server = LoggedServer::start(&arguments);
+
+    let mut car = configuration("client", &[], &[&endpoint]);
+    car.insert_json5("transport/link/tls", &json!({ "root_ca_certificate": authority }).to_string()).unwrap();
+    let login = json!({ "user": "north/car-1", "password": "first" });
+    car.insert_json5("transport/auth/usrpwd", &login.to_string()).unwrap();
+    let car = zenoh::open(car).await.unwrap();
+    server_is_there(&car, true).await;
+    let drive = drives::simulated(1, 20);
+    let start = SessionStart { fleet_id: "north".to_owned(), vehicle_id: "car-1".to_owned(), ..drive.wire_start() };
+    let (mut stream, _) = RawZenohStream::started(&car, start).await;
+    stream.stream(&drive.frames, 10).await;
+    let log = server.kill();
+    assert!(log.lines().count() > 100, "nothing is logged: {log}");
+    let shown = log.lines().find(|line| line.contains("password-of-secrets"));
+    assert!(shown.is_none(), "{shown:?}");
 }

@@ -65,8 +65,9 @@ impl AccessRules {
         servers: Vec<String>,
     ) -> Result<Self, CredentialError> {
         let proofs = Proofs { certificate: listed.is_some(), password: passwords.is_some() };
-        let listed = listed.map(|path| names("zenoh_vehicles_file", path, |line| line)).transpose()?;
-        let with_password = passwords.map(|path| names("zenoh_passwords_file", path, before_colon)).transpose()?;
+        let listed = listed.map(|path| names("zenoh_vehicles_file", path, |line| line, &servers)).transpose()?;
+        let with_password =
+            passwords.map(|path| names("zenoh_passwords_file", path, before_colon, &servers)).transpose()?;
         let vehicles = match (listed, with_password) {
             (Some(listed), Some(with_password)) => listed.intersection(&with_password).cloned().collect(),
             (listed, with_password) => listed.or(with_password).unwrap_or_default(),
@@ -167,23 +168,25 @@ fn before_colon(line: &str) -> &str {
     line.split_once(':').map_or(line, |(name, _)| name.trim())
 }
 
-/// The vehicles that a file names, one on a line; empty lines and lines that begin with `#` are passed over.
+/// The vehicles that a file names, one on a line; empty lines, lines that begin with `#` and `servers` are passed over.
 fn names(
     setting: &'static str,
     path: &Path,
     name: impl Fn(&str) -> &str,
+    servers: &[String],
 ) -> Result<BTreeSet<VehicleName>, CredentialError> {
     let bytes = read(setting, path)?;
     let text = str::from_utf8(&bytes).map_err(|error| CredentialError::new(setting, path, error))?;
     let lines = text.lines().map(str::trim).enumerate();
-    let named = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
-    let vehicle = |(index, line): (usize, &str)| {
-        name(line).parse::<VehicleName>().map_err(|error| {
+    let lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
+    let named = lines.map(|(index, line)| (index, name(line)));
+    let vehicle = |(index, name): (usize, &str)| {
+        name.parse::<VehicleName>().map_err(|error| {
             // The line itself may hold a password.
             CredentialError::new(setting, path, format!("line {}: {error}", index + 1))
         })
     };
-    named.map(vehicle).collect()
+    named.filter(|(_, name)| !servers.iter().any(|server| server == name)).map(vehicle).collect()
 }
 
 #[cfg(test)]

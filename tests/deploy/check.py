@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import signal
+import ssl
 import subprocess
 import sys
 import tempfile
@@ -109,8 +110,9 @@ def image(lanemap, folder):
 
 
 @contextlib.contextmanager
-def container(folder, settings, state):
-    """The image's own command in a sandbox as read-only and as powerless as its container; libc comes from this machine."""
+def container(folder, settings, state, command=None):
+    """The image in a sandbox as read-only and as powerless as its container; libc comes from this machine. Runs its own
+    command, or another."""
     user, group = settings["USER"].split(":")
     must(user != "0", "the container runs as root")
     for path in [state, *state.rglob("*")]:
@@ -120,54 +122,87 @@ def container(folder, settings, state):
         "bwrap", "--ro-bind", folder, "/", *binds, "--bind", state, settings["VOLUME"], "--proc", "/proc", "--dev", "/dev",
         "--unshare-user", "--uid", user, "--gid", group, "--unshare-pid", "--unshare-ipc", "--unshare-uts", "--cap-drop", "ALL",
         "--clearenv", "--die-with-parent", "--chdir", settings["WORKDIR"], "--",
-        *settings["ENTRYPOINT"], *settings["CMD"],
+        *settings["ENTRYPOINT"], *(command or settings["CMD"]),
     ]
     print("$", shlex.join(map(str, command)), flush=True)
     process = subprocess.Popen(list(map(str, command)))
     try:
         yield process
+        # bwrap's child is the server: it gets the signal that the container file names.
+        child = int(subprocess.check_output(["pgrep", "-P", str(process.pid)]).split()[0])
+        children = subprocess.run(["pgrep", "-P", str(child)], stdout=subprocess.PIPE).stdout.split()
+        os.kill(int(children[0]) if children else child, signal.Signals[settings["STOPSIGNAL"]])
+        must(process.wait(STOPPED_WITHIN_S) == 0, f"the server stopped with status {process.returncode}")
     finally:
         process.kill()
         process.wait()
 
 
-def answer(url):
+def answer(url, tls=None):
+    """Body of an answer with status 200, the status of another, or None where nobody answers."""
     try:
-        with urllib.request.urlopen(url, timeout=5) as response:
+        with urllib.request.urlopen(url, timeout=5, context=tls) as response:
             return response.read()
+    except urllib.error.HTTPError as error:
+        return error.code
     except (urllib.error.URLError, ConnectionError, TimeoutError):
         return None
 
 
-def wait_ready(url, process):
+def wait_ready(url, process, tls=None):
     deadline = time.monotonic() + READY_WITHIN_S
-    while answer(f"{url}/readyz") is None:
+    while not isinstance(answer(f"{url}/readyz", tls), bytes):
         must(process.poll() is None, f"the server ended with status {process.returncode} before it was ready")
         must(time.monotonic() < deadline, f"{url}/readyz did not answer within {READY_WITHIN_S} s")
         time.sleep(0.1)
 
 
-def shipped_configuration(lanemap, target):
-    """The container's command on the shipped configuration: it serves, takes drives, counts them, stops cleanly."""
+def certificates(folder):
+    """The files that the shipped configuration names, as an operator would put them there."""
+    folder.mkdir(parents=True)
+    key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
+    for name, subject in (("server", "/CN=localhost"), ("vehicles-ca", "/CN=vehicles")):
+        run("openssl", "req", "-x509", *key, "-days", "2", "-subj", subject, "-addext", "subjectAltName=DNS:localhost",
+            "-keyout", folder / f"{name}.key", "-out", folder / f"{name}.crt", stderr=subprocess.DEVNULL)
+    for file in folder.iterdir():
+        file.chmod(0o644)
+
+
+@contextlib.contextmanager
+def laid_out(lanemap, target):
+    """The image's files and an empty volume."""
     with tempfile.TemporaryDirectory(dir=target) as folder, tempfile.TemporaryDirectory(dir=target) as state:
         folder, state = pathlib.Path(folder), pathlib.Path(state)
         os.chmod(folder, 0o755)
         settings = image(lanemap, folder)
         for name in ("lib", "lib64", "usr/lib", "proc", "dev"):
             (folder / name).mkdir(parents=True, exist_ok=True)
+        yield folder, state, settings
+
+
+def shipped_configuration(lanemap, target):
+    """The container's own command on the shipped configuration: it serves through TLS, and maps to nobody unknown."""
+    with laid_out(lanemap, target) as (folder, state, settings):
+        tls_folder = folder / "etc/lanemap/tls"
+        certificates(tls_folder)
+        tls = ssl.create_default_context(cafile=tls_folder / "server.crt")
         with container(folder, settings, state) as process:
+            url = f"https://localhost:{settings['EXPOSE']}"
+            wait_ready(url, process, tls)
+            must(b"<html" in answer(f"{url}/viewer", tls).lower(), "the viewer is not in the image")
+            must(answer(f"{url}/sessions", tls) == 401, "whoever asks may read")
+            must(any(state.iterdir()), "the volume stayed empty")
+
+
+def composed(lanemap, target):
+    """The server as compose.yaml starts it: it takes drives, counts them, stops cleanly."""
+    command = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["lanemap"]["command"]
+    with laid_out(lanemap, target) as (folder, state, settings):
+        with container(folder, settings, state, command) as process:
             url = f"http://127.0.0.1:{settings['EXPOSE']}"
             wait_ready(url, process)
-            must(b"<html" in answer(f"{url}/viewer").lower(), "the viewer is not in the image")
             run(lanemap, "bench", "ingest", "--server", url, "--vehicles", 5, "--seconds", 2)
-            metrics = answer(f"{url}/metrics")
-            run("promtool", "check", "metrics", input=metrics)
-            must(any(state.iterdir()), "the volume stayed empty")
-            # bwrap's child is the server: it gets the signal that the container file names.
-            child = int(subprocess.check_output(["pgrep", "-P", str(process.pid)]).split()[0])
-            children = subprocess.run(["pgrep", "-P", str(child)], stdout=subprocess.PIPE).stdout.split()
-            os.kill(int(children[0]) if children else child, signal.Signals[settings["STOPSIGNAL"]])
-            must(process.wait(STOPPED_WITHIN_S) == 0, f"the server stopped with status {process.returncode}")
+            run("promtool", "check", "metrics", input=answer(f"{url}/metrics"))
 
 
 def must(holds, otherwise):
@@ -182,6 +217,7 @@ def main():
     grafana()
     unit(lanemap, target)
     shipped_configuration(lanemap, target)
+    composed(lanemap, target)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ use lanemap_tests::{
 use tonic::{Code, Status};
 
 /// Longest wait for what takes a second or two.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 const FLEET: &str = "fleet-q7x4m2";
 const VEHICLE: &str = "vehicle-z9k3w8";
@@ -213,7 +213,7 @@ impl LoggingServer {
         let log = Arc::<Mutex<Vec<u8>>>::default();
         let (mut stderr, into) = (child.stderr.take().unwrap(), Arc::clone(&log));
         let reader = thread::spawn(move || {
-            let mut piece = [0; 65536];
+            let mut piece = [0; 4096];
             while let Ok(count @ 1..) = stderr.read(&mut piece) {
                 into.lock().unwrap().extend_from_slice(&piece[..count]);
             }

@@ -9,7 +9,7 @@ use lanemap_core::FrameLimits;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::auth::exposure;
+use crate::{auth::exposure, privacy::TripCut};
 
 mod credentials;
 mod overrides;
@@ -109,6 +109,15 @@ pub struct ServerConfig {
     /// File of the key behind the pseudonyms of vehicles and drives, within the store's folder unless it is absolute.
     /// Made at the first start where it is not there; without it no drive of the store can be resumed or deleted.
     pub privacy_key_file: PathBuf,
+    /// Distance from either end of a trip within which nothing is mapped, metres as the crow flies; 0: none. What is
+    /// cut is acked. A drive keeps the cut with which it began.
+    pub trip_cut_m: f64,
+    /// Time from either end of a trip within which nothing is mapped, seconds; 0: none. A frame is mapped where it lies
+    /// beyond both the distance and the time.
+    pub trip_cut_s: f64,
+    /// Time without a frame, or without leaving the distance of the cut, that ends a trip, seconds: what comes then sets
+    /// out anew.
+    pub trip_stop_s: f64,
 }
 
 impl Default for ServerConfig {
@@ -155,6 +164,9 @@ impl Default for ServerConfig {
             drain_delay_ms: 0,
             shutdown_grace_s: 6,
             privacy_key_file: PathBuf::from("privacy.key"),
+            trip_cut_m: 0.0,
+            trip_cut_s: 0.0,
+            trip_stop_s: 1800.0,
         }
     }
 }
@@ -248,6 +260,9 @@ impl ServerConfig {
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;
+        within("trip_cut_m", self.trip_cut_m, 0.0, 1e5, "0 ..= 1e5")?;
+        within("trip_cut_s", self.trip_cut_s, 0.0, 86_400.0, "0 ..= 86400")?;
+        within("trip_stop_s", self.trip_stop_s, 1.0, 1e6, "1 ..= 1e6")?;
         within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")?;
         within("tls_handshake_timeout_s", self.tls_handshake_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("max_tls_handshakes", self.max_tls_handshakes as f64, 1.0, 1e6, "1 ..= 1e6")?;
@@ -277,6 +292,11 @@ impl ServerConfig {
             max_point_range_m: self.max_point_range_m,
             max_odometry_range_m: self.max_odometry_range_m,
         }
+    }
+
+    /// The cut of drives that begin now.
+    pub(crate) fn trip_cut(&self) -> TripCut {
+        TripCut { distance_m: self.trip_cut_m, time_s: self.trip_cut_s, stop_s: self.trip_stop_s }
     }
 
     pub(crate) fn privacy_key_path(&self) -> PathBuf {

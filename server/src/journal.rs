@@ -156,6 +156,23 @@ impl Journal {
         outcome.await.map_err(|_| JournalError::Closed)?
     }
 
+    /// Makes durable how far a drive has come where its frames are cut, and so not in the journal. The next snapshot
+    /// replaces it.
+    ///
+    /// # Errors
+    /// The store failed.
+    pub async fn put_cut_mark(&self, session: SessionId, mark: Vec<u8>) -> Result<(), JournalError> {
+        self.commit(|done| Commit::CutMark { session, mark, done }).await
+    }
+
+    /// What [`Journal::put_cut_mark`] put, where no snapshot came after. Reads the disk.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn cut_mark(&self, session: SessionId) -> Result<Option<Vec<u8>>, JournalError> {
+        self.store.cut_mark(session)
+    }
+
     /// Every session's record, in the order of the ids. Reads the disk.
     ///
     /// # Errors
@@ -180,9 +197,23 @@ impl Journal {
         self.store.snapshot(session)
     }
 
-    /// The frames of a session that its snapshot does not cover, in the order of their sequence. Reads the disk.
-    pub fn frames(&self, session: SessionId) -> impl Iterator<Item = Result<Frame, JournalError>> {
-        self.store.frames(session)
+    /// The frames of a session after `covered`, in the order of their sequence. Reads the disk.
+    pub fn frames_after(
+        &self,
+        session: SessionId,
+        covered: Option<Sequence>,
+    ) -> impl Iterator<Item = Result<Frame, JournalError>> {
+        self.store.frames(session, covered, Sequence(u64::MAX))
+    }
+
+    /// The frames of a session after `covered` up to `last`, inclusive, in the order of their sequence. Reads the disk.
+    pub fn frames_between(
+        &self,
+        session: SessionId,
+        covered: Option<Sequence>,
+        last: Sequence,
+    ) -> impl Iterator<Item = Result<Frame, JournalError>> {
+        self.store.frames(session, covered, last)
     }
 }
 
@@ -195,6 +226,7 @@ mod tests {
     use lanemap_core::{FrameLimits, FrameParts, Odometry, Preset, Sensor, TimestampNs, geometry::Pose};
 
     use super::*;
+    use crate::privacy::TripCut;
 
     fn frame(sequence: u64) -> Frame {
         let odometry = Odometry { odometry_from_vehicle: Pose::identity(), motion_covariance: None };
@@ -224,12 +256,13 @@ mod tests {
             drive: pseudonyms().drive(&key),
             vehicle: pseudonyms().vehicle(&key.fleet, &key.vehicle),
             setup: SessionSetup { preset: Preset::Paper, sensor: Sensor::default() },
+            cut: TripCut::default(),
             ended: false,
         }
     }
 
     fn sequences(journal: &Journal, session: SessionId) -> Vec<u64> {
-        journal.frames(session).map(|frame| frame.unwrap().sequence().0).collect()
+        journal.frames_after(session, None).map(|frame| frame.unwrap().sequence().0).collect()
     }
 
     #[tokio::test]

@@ -162,6 +162,18 @@ pub struct ServeArgs {
     /// made at the first start [env: LANEMAP_PRIVACY_KEY_FILE] [default: privacy.key]
     #[arg(long, value_name = "FILE")]
     privacy_key_file: Option<PathBuf>,
+    /// Distance from either end of a trip within which nothing is mapped, metres as the crow flies; 0: none
+    /// [env: LANEMAP_TRIP_CUT_M] [default: 0.0]
+    #[arg(long, value_name = "M")]
+    trip_cut_m: Option<f64>,
+    /// Time from either end of a trip within which nothing is mapped, seconds; 0: none
+    /// [env: LANEMAP_TRIP_CUT_S] [default: 0.0]
+    #[arg(long, value_name = "S")]
+    trip_cut_s: Option<f64>,
+    /// Time without a frame, or without leaving the distance of the cut, that ends a trip, seconds
+    /// [env: LANEMAP_TRIP_STOP_S] [default: 1800.0]
+    #[arg(long, value_name = "S")]
+    trip_stop_s: Option<f64>,
 }
 
 impl ServeArgs {
@@ -207,6 +219,9 @@ impl ServeArgs {
             drain_delay_ms: self.drain_delay_ms,
             shutdown_grace_s: self.shutdown_grace_s,
             privacy_key_file: self.privacy_key_file.clone(),
+            trip_cut_m: self.trip_cut_m,
+            trip_cut_s: self.trip_cut_s,
+            trip_stop_s: self.trip_stop_s,
         }
     }
 }

@@ -87,6 +87,12 @@ pub struct ConfigOverrides {
     pub shutdown_grace_s: Option<u64>,
     /// See [`ServerConfig::privacy_key_file`].
     pub privacy_key_file: Option<PathBuf>,
+    /// See [`ServerConfig::trip_cut_m`].
+    pub trip_cut_m: Option<f64>,
+    /// See [`ServerConfig::trip_cut_s`].
+    pub trip_cut_s: Option<f64>,
+    /// See [`ServerConfig::trip_stop_s`].
+    pub trip_stop_s: Option<f64>,
 }
 
 impl ConfigOverrides {
@@ -131,6 +137,9 @@ impl ConfigOverrides {
         set(&mut settings.drain_delay_ms, self.drain_delay_ms);
         set(&mut settings.shutdown_grace_s, self.shutdown_grace_s);
         set(&mut settings.privacy_key_file, self.privacy_key_file);
+        set(&mut settings.trip_cut_m, self.trip_cut_m);
+        set(&mut settings.trip_cut_s, self.trip_cut_s);
+        set(&mut settings.trip_stop_s, self.trip_stop_s);
     }
 }
 

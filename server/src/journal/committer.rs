@@ -21,6 +21,8 @@ pub(super) enum Commit {
     Record { record: SessionRecord, done: Done },
     /// A snapshot, and the frames that it covers are removed.
     Snapshot { session: SessionId, covered: Sequence, bytes: Vec<u8>, done: Done },
+    /// How far a drive has come whose frames are cut.
+    CutMark { session: SessionId, mark: Vec<u8>, done: Done },
     /// All that there is of some drives is removed.
     Forget { forget: Forget, done: Done },
 }
@@ -122,6 +124,10 @@ fn add(batch: &mut StoreBatch<'_>, commit: Commit) -> Result<(usize, Done), (Jou
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),
         },
+        Commit::CutMark { session, mark, done } => {
+            batch.put_cut_mark(session, mark);
+            Ok((0, done))
+        }
         Commit::Forget { forget, done } => match batch.forget(&forget) {
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),

@@ -157,8 +157,8 @@ impl Store {
         Ok(())
     }
 
-    fn keyspaces(&self) -> [&Keyspace; 5] {
-        [&self.records, &self.frames, &self.snapshots, &self.facts, &self.forgotten]
+    fn keyspaces(&self) -> [&Keyspace; 6] {
+        [&self.records, &self.frames, &self.snapshots, &self.cuts, &self.facts, &self.forgotten]
     }
 }
 

@@ -10,7 +10,10 @@ use super::{
     JournalError, SessionKey, SessionRecord, SessionSetup, decode_error,
     store::{Store, StoreBatch},
 };
-use crate::{privacy::Pseudonyms, session::SessionId};
+use crate::{
+    privacy::{Pseudonyms, TripCut},
+    session::SessionId,
+};
 
 /// The keyspace of such records.
 const NAMED: &str = "sessions";
@@ -57,7 +60,7 @@ fn with_pseudonyms(record: NamedRecord, pseudonyms: &Pseudonyms) -> SessionRecor
     let NamedRecord { id, key: NamedKey { fleet, vehicle, drive }, setup, ended } = record;
     let vehicle_pseudonym = pseudonyms.vehicle(&fleet, &vehicle);
     let drive = pseudonyms.drive(&SessionKey { fleet, vehicle, drive });
-    SessionRecord { id, drive, vehicle: vehicle_pseudonym, setup, ended }
+    SessionRecord { id, drive, vehicle: vehicle_pseudonym, setup, cut: TripCut::default(), ended }
 }
 
 #[cfg(test)]
@@ -86,7 +89,8 @@ mod tests {
         let pseudonyms = Pseudonyms::open(&folder.path().join("privacy.key"), None).unwrap();
         let key = SessionKey { fleet: "fleet-7".into(), vehicle: "vehicle-8".into(), drive: "drive-9".into() };
         let vehicle = pseudonyms.vehicle("fleet-7", "vehicle-8");
-        let expected = SessionRecord { id, drive: pseudonyms.drive(&key), vehicle, setup, ended: true };
+        let expected =
+            SessionRecord { id, drive: pseudonyms.drive(&key), vehicle, setup, cut: TripCut::default(), ended: true };
 
         for _ in 0..2 {
             let (journal, thread) = Journal::open(folder.path(), 100).unwrap();

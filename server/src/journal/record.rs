@@ -6,7 +6,7 @@ use lanemap_core::{Preset, Sensor};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    privacy::{DrivePseudonym, VehiclePseudonym},
+    privacy::{DrivePseudonym, TripCut, VehiclePseudonym},
     session::SessionId,
 };
 
@@ -48,6 +48,8 @@ pub struct SessionRecord {
     pub vehicle: VehiclePseudonym,
     /// How it is mapped.
     pub setup: SessionSetup,
+    /// What is cut off its trips.
+    pub cut: TripCut,
     /// Whether the drive is over.
     pub ended: bool,
 }

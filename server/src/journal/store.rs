@@ -5,6 +5,7 @@
 //! | `records`   | id, 8 bytes big-endian                       | record, postcard            |
 //! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard             |
 //! | `snapshots` | id                                           | the session's own bytes     |
+//! | `cuts`      | id                                           | how far the drive has come where its frames are cut |
 //! | `facts`     | `privacy key`                                | the key's fingerprint       |
 //! |             | `erasure due`                                | none: what was removed is still on the disk |
 //! | `forgotten` | pseudonym of a drive that was deleted        | day of it                   |
@@ -31,6 +32,7 @@ pub(super) struct Store {
     pub(super) records: Keyspace,
     pub(super) frames: Keyspace,
     pub(super) snapshots: Keyspace,
+    pub(super) cuts: Keyspace,
     pub(super) facts: Keyspace,
     pub(super) forgotten: Keyspace,
     pub(super) filler: Keyspace,
@@ -53,8 +55,9 @@ impl Store {
         let database = Database::builder(folder).open()?;
         let keyspace = |name| database.keyspace(name, KeyspaceCreateOptions::default);
         let (records, frames, snapshots) = (keyspace("records")?, keyspace("frames")?, keyspace("snapshots")?);
-        let (facts, forgotten, filler) = (keyspace("facts")?, keyspace("forgotten")?, keyspace("filler")?);
-        Ok(Self { folder: folder.to_owned(), database, records, frames, snapshots, facts, forgotten, filler })
+        let (cuts, facts) = (keyspace("cuts")?, keyspace("facts")?);
+        let (forgotten, filler) = (keyspace("forgotten")?, keyspace("filler")?);
+        Ok(Self { folder: folder.to_owned(), database, records, frames, snapshots, cuts, facts, forgotten, filler })
     }
 
     pub(super) fn batch(&self) -> StoreBatch<'_> {
@@ -78,12 +81,25 @@ impl Store {
         Ok(Some(KeyFingerprint(bytes)))
     }
 
+    pub(super) fn cut_mark(&self, session: SessionId) -> Result<Option<Vec<u8>>, JournalError> {
+        Ok(self.cuts.get(session.to_key())?.map(|value| value.to_vec()))
+    }
+
     pub(super) fn snapshot(&self, session: SessionId) -> Result<Option<Vec<u8>>, JournalError> {
         Ok(self.snapshots.get(session.to_key())?.map(|value| value.to_vec()))
     }
 
-    pub(super) fn frames(&self, session: SessionId) -> impl Iterator<Item = Result<Frame, JournalError>> + use<> {
-        self.frames.prefix(session.to_key()).map(move |entry| {
+    pub(super) fn frames(
+        &self,
+        session: SessionId,
+        after: Option<Sequence>,
+        last: Sequence,
+    ) -> impl Iterator<Item = Result<Frame, JournalError>> + use<> {
+        let first = after.map_or(0, |after| after.0.saturating_add(1));
+        // A range that ends before it begins is none.
+        let keys = frame_key(session, Sequence(first.min(last.0)))..=frame_key(session, last);
+        let entries = self.frames.range(keys).filter(move |_| first <= last.0);
+        entries.map(move |entry| {
             let value = entry.value()?;
             let what = || format!("a frame of session {session}");
             postcard::from_bytes(&value).map_err(|error| decode_error(&what(), &error))
@@ -118,7 +134,12 @@ impl StoreBatch<'_> {
             self.batch.remove(&self.store.frames, entry.key()?);
         }
         self.batch.insert(&self.store.snapshots, session.to_key(), bytes);
+        self.batch.remove(&self.store.cuts, session.to_key());
         Ok(())
+    }
+
+    pub(super) fn put_cut_mark(&mut self, session: SessionId, mark: Vec<u8>) {
+        self.batch.insert(&self.store.cuts, session.to_key(), mark);
     }
 
     /// Removes all that the store has of a session.
@@ -127,6 +148,7 @@ impl StoreBatch<'_> {
             self.batch.remove(&self.store.frames, entry.key()?);
         }
         self.batch.remove(&self.store.snapshots, session.to_key());
+        self.batch.remove(&self.store.cuts, session.to_key());
         self.batch.remove(&self.store.records, session.to_key());
         Ok(())
     }

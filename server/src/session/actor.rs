@@ -20,7 +20,8 @@ use tonic::Status;
 
 use super::{
     SessionRecord, SessionState, Sessions,
-    drive::{Admission, Drive, DriveError},
+    drive::{Admission, Drive, DriveError, Loaded},
+    registry::blocking,
 };
 use crate::{
     config::ServerConfig,
@@ -110,6 +111,8 @@ struct Batch {
     frames: Vec<(Frame, Instant)>,
     journal: Vec<JournalFrame>,
     repeated: bool,
+    /// Frames that were cut: they are acked once it is durable how far the drive has come. Never beside other frames.
+    cut: u64,
 }
 
 /// Whether the actor goes on.
@@ -125,16 +128,21 @@ enum ActorError {
     Forgotten,
 }
 
+impl Batch {
+    /// Whether the batch must be committed before a frame that is cut, or not, comes into it.
+    fn must_precede(&self, cut: bool) -> bool {
+        if cut { !self.frames.is_empty() } else { self.cut > 0 }
+    }
+}
+
 impl Actor {
     pub(crate) fn new(
         surroundings: Surroundings,
-        record: SessionRecord,
-        drive: Drive,
+        Loaded { record, drive, replayed }: Loaded,
         commands: mpsc::Receiver<Command>,
     ) -> Self {
         let now = Instant::now();
-        let unload_at = now + surroundings.config.unload_after();
-        Self {
+        let mut actor = Self {
             surroundings,
             record,
             drive,
@@ -142,10 +150,12 @@ impl Actor {
             stream: None,
             unpublished: false,
             next_publication: now,
-            unload_at,
-            frames_since_snapshot: 0,
+            unload_at: now,
+            frames_since_snapshot: replayed,
             leaving: false,
-        }
+        };
+        actor.unload_at = actor.unload_time();
+        actor
     }
 
     /// Runs until the session leaves memory, the service shuts down, or the journal fails.
@@ -188,7 +198,11 @@ impl Actor {
             },
             () = sleep_until(self.next_publication), if self.unpublished => self.publish(),
             () = cancelled(gone) => self.detach(Ok(())),
-            () = sleep_until(self.unload_at), if detached => return Ok(false),
+            () = sleep_until(self.unload_at), if detached => {
+                // Frames are held no longer than a trip pauses.
+                self.end_trip();
+                return Ok(false);
+            }
             () = self.surroundings.shutdown.cancelled(), if detached => return Ok(false),
         }
         Ok(true)
@@ -252,7 +266,7 @@ impl Actor {
 
     fn detach(&mut self, with: Result<(), Status>) {
         let stream = self.stream.take();
-        self.unload_at = Instant::now() + self.surroundings.config.unload_after();
+        self.unload_at = self.unload_time();
         // Published before the vehicle hears of it: who waits for the end of a stream reads all of its frames.
         self.publish();
         if let Some(stream) = stream {
@@ -260,17 +274,36 @@ impl Actor {
         }
     }
 
+    /// When a drive without a stream leaves memory. One that holds frames stays until its trip counts as over.
+    fn unload_time(&self) -> Instant {
+        let after = self.surroundings.config.unload_after();
+        let stop = Duration::from_secs_f64(self.record.cut.stop_s);
+        Instant::now() + if self.drive.holds_frames() { after.max(stop) } else { after }
+    }
+
+    fn end_trip(&mut self) {
+        if self.drive.end_trip() {
+            // What was held is erased by the next snapshot.
+            self.frames_since_snapshot = self.frames_since_snapshot.max(1);
+        }
+    }
+
     /// Puts a frame into the batch where it is next in its drive.
     async fn admit(&mut self, stream: StreamNumber, frame: Frame, arrived: Instant, batch: &mut Batch) -> Outcome {
-        let Some(current) = self.stream.as_ref().filter(|current| current.number == stream) else { return Ok(()) };
+        let current = self.stream.as_ref().filter(|current| current.number == stream);
+        let Some(outbox) = current.map(|current| current.outbox.clone()) else { return Ok(()) };
         if self.record.ended {
             let limit = "no frame after the end of the drive";
             let refusal = Refusal::new(RefusalReason::OutOfTurn, "frame", "a frame", limit).of_frame(frame.sequence());
-            current.outbox.refuse(&refusal).await;
+            outbox.refuse(&refusal).await;
             return Ok(());
         }
         let bytes = frame_bytes(&frame)?;
+        if batch.must_precede(self.drive.would_cut(&frame)) {
+            self.commit(batch).await?;
+        }
         match self.drive.admit(&frame, &bytes) {
+            Admission::Cut => batch.cut += 1,
             Admission::New => {
                 batch.journal.push(JournalFrame { sequence: frame.sequence(), bytes });
                 batch.frames.push((frame, arrived));
@@ -279,14 +312,17 @@ impl Actor {
                 metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
                 batch.repeated = true;
             }
-            Admission::Refused(refusal) => current.outbox.refuse(&refusal).await,
+            Admission::Refused(refusal) => outbox.refuse(&refusal).await,
         }
         Ok(())
     }
 
     /// Makes the batch durable, acks it, maps it.
     async fn commit(&mut self, batch: &mut Batch) -> Outcome {
-        let Batch { frames, journal, repeated } = std::mem::take(batch);
+        let Batch { frames, journal, repeated, cut } = std::mem::take(batch);
+        if cut > 0 {
+            return self.commit_cut(cut).await;
+        }
         if frames.is_empty() {
             if repeated {
                 self.ack();
@@ -300,16 +336,45 @@ impl Actor {
         }
         metrics::counter!(telemetry::FRAMES_ACKED).increment(frames.len() as u64);
         self.frames_since_snapshot += frames.len() as u64;
-        for some in frames.chunks(STEPS_IN_A_ROW) {
-            for (frame, _) in some {
-                self.map(frame);
-            }
-            tokio::task::yield_now().await;
+        if self.drive.holds_back() {
+            let ready = self.ready_frames().await?;
+            self.map_all(ready.iter()).await;
+        } else {
+            self.map_all(frames.iter().map(|(frame, _)| frame)).await;
         }
         if self.frames_since_snapshot >= self.surroundings.config.snapshot_every_frames {
             self.save().await?;
         }
         Ok(())
+    }
+
+    /// Makes durable how far the drive has come with frames that were cut, and acks them.
+    async fn commit_cut(&mut self, frames: u64) -> Outcome {
+        if self.frames_since_snapshot > 0 {
+            // The trip stopped. What was held before is erased with this.
+            self.save().await?;
+        } else {
+            self.surroundings.journal.put_cut_mark(self.record.id, self.drive.cut_mark()?).await?;
+        }
+        self.ack();
+        metrics::counter!(telemetry::FRAMES_ACKED).increment(frames);
+        Ok(())
+    }
+
+    /// The frames that were held back until now.
+    async fn ready_frames(&self) -> Result<Vec<Frame>, JournalError> {
+        let Some(through) = self.drive.ready() else { return Ok(Vec::new()) };
+        let (journal, session, covered) = (self.surroundings.journal.clone(), self.record.id, self.drive.covered());
+        blocking(move || journal.frames_between(session, covered, through).collect()).await
+    }
+
+    async fn map_all(&mut self, frames: impl Iterator<Item = &Frame>) {
+        for (index, frame) in frames.enumerate() {
+            self.map(frame);
+            if (index + 1) % STEPS_IN_A_ROW == 0 {
+                tokio::task::yield_now().await;
+            }
+        }
     }
 
     fn ack(&self) {
@@ -336,9 +401,11 @@ impl Actor {
             return Ok(());
         }
         if !self.record.ended {
+            // A crash between leaves a drive that the client ends again.
+            self.end_trip();
+            self.save().await?;
             self.record.ended = true;
             self.surroundings.journal.put_record(self.record.clone()).await?;
-            self.save().await?;
         }
         let acked_sequence_inclusive = self.drive.last_sequence().map(|sequence| sequence.0);
         self.publish();
@@ -351,7 +418,7 @@ impl Actor {
 
     /// Saves the drive's state where it changed, and trims the journal.
     async fn save(&mut self) -> Outcome {
-        let Some(covered) = self.drive.last_sequence().filter(|_| self.frames_since_snapshot > 0) else {
+        let Some(covered) = self.drive.covered().filter(|_| self.frames_since_snapshot > 0) else {
             return Ok(());
         };
         let bytes = self.drive.snapshot()?;
@@ -373,6 +440,10 @@ impl Actor {
             (None, false) => SessionState::Idle,
         };
         let started = Instant::now();
+        if self.drive.is_hidden() {
+            self.unpublished = false;
+            return;
+        }
         self.surroundings.sessions.publish(self.drive.published(self.record.id, state));
         let now = Instant::now();
         self.next_publication = now + self.publication_pause(now - started);

@@ -8,16 +8,48 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::{
-    MapVersion, PublishedMap, SessionId, SessionSetup, SessionState,
+    MapVersion, PublishedMap, SessionId, SessionRecord, SessionSetup, SessionState,
     recent::{REMEMBERED, RecentFrames, Recollection},
 };
-use crate::{ingest::Refusal, journal::frame_bytes};
+use crate::{
+    ingest::Refusal,
+    journal::{Journal, JournalError, frame_bytes},
+    privacy::{
+        TripCut,
+        trip_cut::{Passage, TripEnds},
+    },
+};
 
 /// The mapper of a drive, and which frames it has had.
 #[derive(Debug)]
 pub(crate) struct Drive {
     mapper: Mapper,
     progress: Progress,
+    cut: TripCut,
+    ends: Ends,
+}
+
+/// A drive as the store knows it.
+#[derive(Debug)]
+pub(crate) struct Loaded {
+    pub(crate) record: SessionRecord,
+    pub(crate) drive: Drive,
+    /// Frames after its snapshot.
+    pub(crate) replayed: u64,
+}
+
+/// What is cut off the ends of a drive's trips. Stands still where nothing is cut.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Ends {
+    trip: TripEnds,
+    /// The last frame that was cut.
+    cut: Option<Sequence>,
+    /// Every frame up to this one was mapped, cut or erased.
+    settled: Option<Sequence>,
+    /// The last frame that may be mapped.
+    ready: Option<Sequence>,
+    /// The last frame that was mapped.
+    mapped: Option<(Sequence, TimestampNs)>,
 }
 
 /// How far a drive has come.
@@ -35,6 +67,8 @@ struct Progress {
 pub(crate) enum Admission {
     /// It is the next one.
     New,
+    /// It is the next one, and is to be forgotten: it lies at an end of the trip.
+    Cut,
     /// It came before: ack it again, do not map it again.
     Repeated,
     /// It does not follow.
@@ -52,22 +86,74 @@ pub(crate) enum DriveError {
     Mapper(#[from] SnapshotError),
 }
 
+impl Loaded {
+    /// Reads a drive from the store: its snapshot, and the frames after it, which are mapped again.
+    pub(crate) fn read(journal: &Journal, record: SessionRecord) -> Result<Self, JournalError> {
+        let damaged = |what: &str, reason: String| JournalError::Decode { what: what.to_owned(), reason };
+        let damaged_state = |error: DriveError| damaged("the session's state", error.to_string());
+        // It may have ended since the caller read it.
+        let record = journal.record(record.id)?.unwrap_or(record);
+        let mut drive = match journal.snapshot(record.id)? {
+            Some(bytes) => Drive::restore(&bytes, record.cut).map_err(damaged_state)?,
+            None => Drive::new(&record.setup, record.cut),
+        };
+        if let Some(mark) = journal.cut_mark(record.id)? {
+            drive.apply_cut_mark(&mark).map_err(damaged_state)?;
+        }
+        let mut replayed = 0;
+        for frame in journal.frames_after(record.id, drive.covered()) {
+            let frame = frame?;
+            replayed += 1;
+            if drive.replay(&frame).map_err(|refusal| damaged("the session's journal", refusal.to_string()))? {
+                drive.map(&frame);
+            }
+            for ready in ready_frames(journal, record.id, &drive)? {
+                drive.map(&ready);
+            }
+        }
+        Ok(Self { record, drive, replayed })
+    }
+}
+
+/// The frames that were held back and may be mapped now. Reads the disk.
+pub(crate) fn ready_frames(journal: &Journal, session: SessionId, drive: &Drive) -> Result<Vec<Frame>, JournalError> {
+    let Some(through) = drive.ready() else { return Ok(Vec::new()) };
+    journal.frames_between(session, drive.covered(), through).collect()
+}
+
 impl Drive {
     /// A drive that has had no frame.
-    pub(crate) fn new(setup: &SessionSetup) -> Self {
+    pub(crate) fn new(setup: &SessionSetup, cut: TripCut) -> Self {
         let mapper = Mapper::new(Params::preset(setup.preset), setup.sensor);
-        Self { mapper, progress: Progress::default() }
+        Self { mapper, progress: Progress::default(), cut, ends: Ends::default() }
     }
 
     /// The drive of [`Drive::snapshot`]'s bytes.
-    pub(crate) fn restore(bytes: &[u8]) -> Result<Self, DriveError> {
-        let (progress, mapper): (Progress, Vec<u8>) = postcard::from_bytes(bytes)?;
-        Ok(Self { mapper: Mapper::restore(&mapper)?, progress })
+    pub(crate) fn restore(bytes: &[u8], cut: TripCut) -> Result<Self, DriveError> {
+        let ((progress, mapper), rest): ((Progress, Vec<u8>), _) = postcard::take_from_bytes(bytes)?;
+        // Snapshots of earlier builds end here.
+        let ends = if rest.is_empty() { Ends::default() } else { postcard::from_bytes(rest)? };
+        Ok(Self { mapper: Mapper::restore(&mapper)?, progress, cut, ends })
     }
 
-    /// The whole state as bytes. Call it only when every frame admitted was mapped.
+    /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
     pub(crate) fn snapshot(&self) -> Result<Vec<u8>, DriveError> {
-        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot()))?)
+        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot(), &self.ends))?)
+    }
+
+    /// How far the drive has come, as bytes, where every frame since the last snapshot was cut.
+    pub(crate) fn cut_mark(&self) -> Result<Vec<u8>, DriveError> {
+        Ok(postcard::to_stdvec(&(self.progress.last, &self.ends))?)
+    }
+
+    fn apply_cut_mark(&mut self, mark: &[u8]) -> Result<(), DriveError> {
+        (self.progress.last, self.ends) = postcard::from_bytes(mark)?;
+        Ok(())
+    }
+
+    /// Whether [`Drive::admit`] would cut `frame` if it is the next one.
+    pub(crate) fn would_cut(&self, frame: &Frame) -> bool {
+        self.ends.trip.would_cut(&self.cut, frame)
     }
 
     /// Whether `frame`, kept as `bytes`, follows the frames before; if so, it counts as had.
@@ -83,14 +169,34 @@ impl Drive {
             }
         }
         self.progress.last = Some((frame.sequence(), frame.time()));
+        if self.cut.is_on() && !self.passes(frame) {
+            return Admission::Cut;
+        }
         self.progress.recent.remember(frame.sequence(), bytes);
         Admission::New
+    }
+
+    /// Whether the frame is to be kept.
+    fn passes(&mut self, frame: &Frame) -> bool {
+        match self.ends.trip.arrive(&self.cut, frame) {
+            Passage::Cut => {
+                self.ends.cut = Some(frame.sequence());
+                self.ends.settled = self.ends.cut;
+                false
+            }
+            Passage::Held { mapped_through } => {
+                self.ends.ready = mapped_through.or(self.ends.ready);
+                true
+            }
+        }
     }
 
     fn admit_again(&self, sequence: Sequence, last: Sequence, bytes: &[u8]) -> Admission {
         let (value, limit) = match self.progress.recent.recall(sequence, bytes) {
             Recollection::Same => return Admission::Repeated,
             Recollection::Other => (format!("{} again, with other content", sequence.0), format!("above {}", last.0)),
+            // Nothing is known of a frame that was cut, but that it came.
+            Recollection::Unknown if Some(sequence) <= self.ends.cut => return Admission::Repeated,
             Recollection::Unknown => {
                 let limit = format!("above {}, or one of the last {REMEMBERED} frames again", last.0);
                 (sequence.0.to_string(), limit)
@@ -100,21 +206,51 @@ impl Drive {
         Admission::Refused(refusal.of_frame(sequence))
     }
 
-    /// Maps a frame that was admitted.
+    /// Maps a frame that was admitted. Where frames are held back, those of [`Drive::ready`], in their order.
     pub(crate) fn map(&mut self, frame: &Frame) -> StepReport {
         self.progress.mapped += 1;
+        if self.cut.is_on() {
+            self.ends.settled = Some(frame.sequence());
+            self.ends.mapped = Some((frame.sequence(), frame.time()));
+        }
         self.mapper.step(frame)
     }
 
-    /// Takes a frame from the journal, which was admitted when it was put there.
-    pub(crate) fn replay(&mut self, frame: &Frame) -> Result<(), Refusal> {
+    /// Whether frames are held back before they are mapped.
+    pub(crate) fn holds_back(&self) -> bool {
+        self.cut.is_on()
+    }
+
+    /// The last of the frames after [`Drive::covered`] that may be mapped now, where frames are held back.
+    pub(crate) fn ready(&self) -> Option<Sequence> {
+        self.ends.ready.filter(|_| self.ends.ready > self.ends.settled)
+    }
+
+    /// Whether frames are held, which are mapped or erased later.
+    pub(crate) fn holds_frames(&self) -> bool {
+        self.ends.trip.holds()
+    }
+
+    /// The trip is over: frames that are held are never mapped, and what comes sets out anew. Whether any were held.
+    pub(crate) fn end_trip(&mut self) -> bool {
+        let held = self.holds_frames();
+        if self.cut.is_on() {
+            self.ends.trip.stop();
+            self.ends.settled = self.last_sequence();
+        }
+        held
+    }
+
+    /// Takes a frame from the journal, which was admitted when it was put there; whether it may be mapped at once.
+    fn replay(&mut self, frame: &Frame) -> Result<bool, Refusal> {
+        if self.cut.is_on() && Some(frame.sequence()) <= self.last_sequence() {
+            // It was held when the snapshot was made.
+            return Ok(false);
+        }
         let bytes = frame_bytes(frame).unwrap_or_default();
         match self.admit(frame, &bytes) {
-            Admission::New => {
-                self.map(frame);
-                Ok(())
-            }
-            Admission::Repeated => Ok(()),
+            Admission::New => Ok(!self.cut.is_on()),
+            Admission::Cut | Admission::Repeated => Ok(false),
             Admission::Refused(refusal) => Err(refusal),
         }
     }
@@ -129,6 +265,21 @@ impl Drive {
         self.progress.last.map(|(sequence, _)| sequence)
     }
 
+    /// Every frame up to this one is in the mapper's state, or never will be.
+    pub(crate) fn covered(&self) -> Option<Sequence> {
+        if self.cut.is_on() { self.ends.settled } else { self.last_sequence() }
+    }
+
+    /// Whether readers are not to know of the drive: nothing of it lies beyond its start.
+    pub(crate) fn is_hidden(&self) -> bool {
+        self.cut.is_on() && self.progress.mapped == 0
+    }
+
+    /// The last frame that readers may know of.
+    fn last_shown(&self) -> Option<(Sequence, TimestampNs)> {
+        if self.cut.is_on() { self.ends.mapped } else { self.progress.last }
+    }
+
     /// What readers are shown.
     pub(crate) fn published(&self, session: SessionId, state: SessionState) -> PublishedMap {
         PublishedMap {
@@ -138,8 +289,8 @@ impl Drive {
             preset: self.mapper.params().preset,
             map: Arc::new(self.mapper.lane_map()),
             map_from_vehicle: self.mapper.map_from_vehicle(),
-            last_sequence: self.last_sequence(),
-            last_time: self.progress.last.map_or(TimestampNs(0), |(_, time)| time),
+            last_sequence: self.last_shown().map(|(sequence, _)| sequence),
+            last_time: self.last_shown().map_or(TimestampNs(0), |(_, time)| time),
             georeference: self.mapper.georeference(),
         }
     }
@@ -161,7 +312,7 @@ mod tests {
     }
 
     fn drive() -> Drive {
-        Drive::new(&SessionSetup { preset: Preset::Default, sensor: Sensor::default() })
+        Drive::new(&SessionSetup { preset: Preset::Default, sensor: Sensor::default() }, TripCut::default())
     }
 
     fn admit(drive: &mut Drive, sequence: u64, time_ns: i64) -> Admission {
@@ -204,7 +355,7 @@ mod tests {
     fn a_restored_drive_knows_which_frames_it_has_had() {
         let mut drive = drive();
         admit(&mut drive, 5, 100);
-        let mut restored = Drive::restore(&drive.snapshot().unwrap()).unwrap();
+        let mut restored = Drive::restore(&drive.snapshot().unwrap(), TripCut::default()).unwrap();
         assert_eq!(admit(&mut restored, 5, 100), Admission::Repeated);
         assert_eq!(restored.progress.mapped, 1);
     }

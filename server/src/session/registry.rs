@@ -9,7 +9,7 @@ use std::{
     time::{SystemTime, UNIX_EPOCH},
 };
 
-use futures::{StreamExt, stream};
+use futures::{StreamExt, future, stream};
 use lanemap_proto::v1::RefusalReason;
 use tokio::{
     sync::{Mutex as AsyncMutex, OwnedSemaphorePermit, Semaphore, mpsc, oneshot},
@@ -24,7 +24,7 @@ use tonic::Status;
 use super::{
     SessionId, SessionKey, SessionRecord, SessionState,
     actor::{Actor, Attach, Attached, Command, StreamNumber, Surroundings},
-    drive::Drive,
+    drive::Loaded,
     forget::Forgotten,
 };
 use crate::{
@@ -119,7 +119,8 @@ impl SessionRegistry {
         let (records, forgotten) = blocking(move || Ok((journal.records()?, journal.forgotten()?))).await?;
         let mut slots = HashMap::with_capacity(records.len());
         let last_id = records.last().map(|record| record.id);
-        stream::iter(&records).for_each_concurrent(cores(), |record| recover_one(&surroundings, record)).await;
+        let recovering = stream::iter(&records).map(|record| recover_one(&surroundings, record));
+        let holding: Vec<Loaded> = recovering.buffer_unordered(cores()).filter_map(future::ready).collect().await;
         for record in records {
             let slot = Slot { record: Some(record.clone()), ..Slot::default() };
             slots.insert(record.drive, Place { vehicle: record.vehicle, slot: Arc::new(AsyncMutex::new(slot)) });
@@ -135,6 +136,9 @@ impl SessionRegistry {
             streams: AtomicU64::new(0),
             actors: TaskTracker::new(),
         };
+        for loaded in holding {
+            shared.resume(loaded);
+        }
         Ok(Self { shared: Arc::new(shared) })
     }
 
@@ -223,7 +227,14 @@ impl SessionRegistry {
     fn new_record(&self, start: &Start) -> SessionRecord {
         let SessionKey { fleet, vehicle, .. } = &start.key;
         let (drive, vehicle) = (self.pseudonyms().drive(&start.key), self.pseudonyms().vehicle(fleet, vehicle));
-        SessionRecord { id: self.next_id(drive), drive, vehicle, setup: start.setup.clone(), ended: false }
+        SessionRecord {
+            id: self.next_id(drive),
+            drive,
+            vehicle,
+            setup: start.setup.clone(),
+            cut: self.shared.surroundings.config.trip_cut(),
+            ended: false,
+        }
     }
 
     fn next_id(&self, drive: DrivePseudonym) -> SessionId {
@@ -256,20 +267,33 @@ impl SessionRegistry {
         if self.shared.surroundings.shutdown.is_cancelled() {
             return Err(Error::ShuttingDown);
         }
-        let surroundings = self.shared.surroundings.clone();
-        let journal = surroundings.journal.clone();
+        let journal = self.shared.surroundings.journal.clone();
         // The record may have ended since the slot was filled: the store knows.
-        let session = record.id;
-        let (record, drive) = {
-            let record = record.clone();
-            blocking(move || load(&journal, record)).await.map_err(|error| unreadable(session, &error))?
-        };
-        slot.record = Some(record.clone());
-        let (commands, waiting) = mpsc::channel(surroundings.config.max_frames_in_flight);
-        let actor = Actor::new(surroundings, record, drive, waiting);
-        let task = self.shared.actors.spawn(actor.run());
-        slot.actor = Some(ActorHandle { commands: commands.clone(), outbox: outbox.clone(), task });
+        let (session, record) = (record.id, record.clone());
+        let loaded = blocking(move || Loaded::read(&journal, record)).await;
+        let loaded = loaded.map_err(|error| unreadable(session, &error))?;
+        slot.record = Some(loaded.record.clone());
+        let actor = self.shared.begin_actor(loaded, outbox.clone());
+        let commands = actor.commands.clone();
+        slot.actor = Some(actor);
         Ok(commands)
+    }
+}
+
+impl Shared {
+    fn begin_actor(&self, loaded: Loaded, outbox: Outbox) -> ActorHandle {
+        let (commands, waiting) = mpsc::channel(self.surroundings.config.max_frames_in_flight);
+        let actor = Actor::new(self.surroundings.clone(), loaded, waiting);
+        ActorHandle { commands, outbox, task: self.actors.spawn(actor.run()) }
+    }
+
+    /// Gives a drive an actor before any stream does.
+    fn resume(&self, loaded: Loaded) {
+        let record = loaded.record.clone();
+        let actor = self.begin_actor(loaded, Outbox::new().0);
+        let slot = Slot { record: Some(record.clone()), actor: Some(actor) };
+        let place = Place { vehicle: record.vehicle, slot: Arc::new(AsyncMutex::new(slot)) };
+        locked(&self.slots).insert(record.drive, place);
     }
 }
 
@@ -313,32 +337,31 @@ async fn attach(
 }
 
 /// Publishes what the store knows of a session; one that cannot be read is reported and left as it is.
-async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) {
+///
+/// Gives the drive where it holds frames: they are not to be held for ever.
+async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) -> Option<Loaded> {
     let (session, journal) = (record.id, surroundings.journal.clone());
     let state = if record.ended { SessionState::Closed } else { SessionState::Idle };
     let loading = record.clone();
-    match blocking(move || Ok(load(&journal, loading)?.1.published(session, state))).await {
-        Ok(published) => surroundings.sessions.publish(published),
-        Err(error) => tracing::error!(%session, %error, "the session cannot be served"),
+    let read = blocking(move || {
+        let loaded = Loaded::read(&journal, loading)?;
+        let published = (!loaded.drive.is_hidden()).then(|| loaded.drive.published(session, state));
+        Ok((published, loaded.drive.holds_frames().then_some(loaded)))
+    });
+    match read.await {
+        Ok((published, holding)) => {
+            published.into_iter().for_each(|published| surroundings.sessions.publish(published));
+            holding
+        }
+        Err(error) => {
+            tracing::error!(%session, %error, "the session cannot be served");
+            None
+        }
     }
 }
 
 fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
-}
-
-/// The drive as the store knows it: its snapshot, and the frames after it mapped again.
-fn load(journal: &Journal, record: SessionRecord) -> Result<(SessionRecord, Drive), JournalError> {
-    let damaged = |what: &str, reason: String| JournalError::Decode { what: what.to_owned(), reason };
-    let record = journal.record(record.id)?.unwrap_or(record);
-    let mut drive = match journal.snapshot(record.id)? {
-        Some(bytes) => Drive::restore(&bytes).map_err(|error| damaged("the session's state", error.to_string()))?,
-        None => Drive::new(&record.setup),
-    };
-    for frame in journal.frames(record.id) {
-        drive.replay(&frame?).map_err(|refusal| damaged("the session's journal", refusal.to_string()))?;
-    }
-    Ok((record, drive))
 }
 
 fn unreadable(session: SessionId, error: &JournalError) -> Error {
@@ -368,7 +391,7 @@ fn capacity(what: &str, maximum: usize) -> Refusal {
 }
 
 /// Runs what reads the disk or maps many frames beside the runtime; a panic there is an error here.
-async fn blocking<T: Send + 'static>(
+pub(super) async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, JournalError> + Send + 'static,
 ) -> Result<T, JournalError> {
     let outcome = tokio::task::spawn_blocking(work).await;

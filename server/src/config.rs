@@ -118,6 +118,8 @@ pub struct ServerConfig {
     /// Time without a frame, or without leaving the distance of the cut, that ends a trip, seconds: what comes then sets
     /// out anew.
     pub trip_stop_s: f64,
+    /// Time after which what was cut has left the store's files, seconds, at least 1: they are written anew for it.
+    pub trip_erase_s: u64,
 }
 
 impl Default for ServerConfig {
@@ -167,6 +169,7 @@ impl Default for ServerConfig {
             trip_cut_m: 0.0,
             trip_cut_s: 0.0,
             trip_stop_s: 1800.0,
+            trip_erase_s: 3600,
         }
     }
 }
@@ -262,6 +265,7 @@ impl ServerConfig {
         within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;
         within("trip_cut_m", self.trip_cut_m, 0.0, 1e5, "0 ..= 1e5")?;
         within("trip_cut_s", self.trip_cut_s, 0.0, 86_400.0, "0 ..= 86400")?;
+        within("trip_erase_s", self.trip_erase_s as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("trip_stop_s", self.trip_stop_s, 1.0, 1e6, "1 ..= 1e6")?;
         within("shutdown_grace_s", self.shutdown_grace_s as f64, 0.0, 3600.0, "0 ..= 3600")?;
         within("tls_handshake_timeout_s", self.tls_handshake_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
@@ -292,6 +296,10 @@ impl ServerConfig {
             max_point_range_m: self.max_point_range_m,
             max_odometry_range_m: self.max_odometry_range_m,
         }
+    }
+
+    pub(crate) fn trip_erase(&self) -> Duration {
+        Duration::from_secs(self.trip_erase_s)
     }
 
     /// The cut of drives that begin now.

@@ -55,6 +55,17 @@ impl From<fjall::Error> for JournalError {
     }
 }
 
+/// A session's whole state at one frame.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    /// The last frame in it.
+    pub covered: Sequence,
+    /// The state, to go on from.
+    pub state: Vec<u8>,
+    /// Whether the frames that it makes needless must leave the disk soon, as those of which nobody may know.
+    pub erase: bool,
+}
+
 /// A frame on its way into the journal.
 #[derive(Clone, Debug)]
 pub struct JournalFrame {
@@ -132,13 +143,8 @@ impl Journal {
     ///
     /// # Errors
     /// The store failed: the old snapshot and the frames stay.
-    pub async fn put_snapshot(
-        &self,
-        session: SessionId,
-        covered: Sequence,
-        bytes: Vec<u8>,
-    ) -> Result<(), JournalError> {
-        self.commit(|done| Commit::Snapshot { session, covered, bytes, done }).await
+    pub async fn put_snapshot(&self, session: SessionId, snapshot: Snapshot) -> Result<(), JournalError> {
+        self.commit(|done| Commit::Snapshot { session, snapshot, done }).await
     }
 
     /// Cancelled once a commit has failed: the store takes no more writes until it is opened anew.
@@ -289,7 +295,8 @@ mod tests {
         let (journal, _thread) = Journal::open(folder.path(), 2).unwrap();
         journal.append(first, journaled(1..=5)).await.unwrap();
         journal.append(second, journaled(1..=5)).await.unwrap();
-        journal.put_snapshot(first, Sequence(3), b"state".to_vec()).await.unwrap();
+        let snapshot = Snapshot { covered: Sequence(3), state: b"state".to_vec(), erase: false };
+        journal.put_snapshot(first, snapshot).await.unwrap();
         assert_eq!(journal.snapshot(first).unwrap().as_deref(), Some(&b"state"[..]));
         assert_eq!(sequences(&journal, first), [4, 5]);
         assert_eq!(sequences(&journal, second), [1, 2, 3, 4, 5]);

@@ -128,14 +128,7 @@ impl Server {
         let (ingest, admin) = (IngestGrpc::new(conversations.clone()), AdminGrpc::new(registry.clone()));
         let (health, router) = router(&config, ingest, admin, http).await?;
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
-        tokio::spawn({
-            let registry = registry.clone();
-            async move {
-                if let Err(error) = registry.finish_forgetting().await {
-                    tracing::error!(%error, "a deletion that was interrupted cannot be finished");
-                }
-            }
-        });
+        tokio::spawn(registry.clone().keep_erasing());
         let zenoh = match config.zenoh_mode {
             ZenohMode::Off => None,
             ZenohMode::Router | ZenohMode::Client => Some(

@@ -12,6 +12,7 @@ use std::{
     time::Duration,
 };
 
+use lanemap_core::{Frame, FrameLimits, FrameParts, GnssFix};
 use lanemap_proto::{
     encode,
     v1::{
@@ -19,12 +20,18 @@ use lanemap_proto::{
         map_service_client::MapServiceClient, stream_observations_request::Message,
     },
 };
-use lanemap_server::{Server, ServerConfig};
+use lanemap_server::{
+    Server, ServerConfig,
+    privacy::{
+        TripCut,
+        trip_cut::{Passage, TripEnds},
+    },
+};
 use lanemap_tests::{
-    drives::{self, Drive},
+    drives::{self, Drive, assert_same_map},
     http,
     raw_stream::RawStream,
-    servers::{self, ServerProcess},
+    servers::{self, ServerProcess, map_bytes},
 };
 use tonic::{Code, Status};
 
@@ -83,7 +90,11 @@ fn contains(bytes: &[u8], pattern: &[u8]) -> bool {
 
 /// What a frame of the drive leaves in the store: a coordinate, bit by bit.
 fn trace_of(drive: &Drive) -> Vec<u8> {
-    drive.frames[drive.frames.len() / 2].detections()[0].points_vehicle[1].y.to_le_bytes().to_vec()
+    trace_of_frame(&drive.frames[drive.frames.len() / 2])
+}
+
+fn trace_of_frame(frame: &Frame) -> Vec<u8> {
+    frame.detections()[0].points_vehicle[1].y.to_le_bytes().to_vec()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -201,10 +212,11 @@ struct LoggingServer {
 }
 
 impl LoggingServer {
-    fn start(folder: &Path) -> Self {
+    fn start(folder: &Path, arguments: &[&str]) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"))
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder)
+            .args(arguments)
             .env("RUST_LOG", "trace")
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -269,7 +281,7 @@ async fn all_answers(url: &str, session: &str) -> Vec<(String, String)> {
 async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_fleet_or_its_drive() {
     const DRIVE: &str = "drive-h5v1t6";
     let folder = tempfile::tempdir().unwrap();
-    let server = LoggingServer::start(folder.path());
+    let server = LoggingServer::start(folder.path(), &[]);
     let url = server.url.clone();
     let drive = drives::simulated(5, 30);
     let begin = || start(&drive, VEHICLE, DRIVE);
@@ -313,4 +325,120 @@ async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_flee
         assert!(line.is_none(), "the log names {name}: {}", String::from_utf8_lossy(line.unwrap()));
         assert!(!on_disk(folder.path(), name.as_bytes()), "the store names {name}");
     }
+}
+
+/// The cut of the tests below: short, as their drives are.
+const CUT: TripCut = TripCut { distance_m: 40.0, time_s: 2.0, stop_s: 1800.0 };
+const CUT_ARGUMENTS: [&str; 6] = ["--trip-cut-m", "40", "--trip-cut-s", "2", "--snapshot-every-frames", "20"];
+
+fn cutting(folder: &Path) -> ServerConfig {
+    ServerConfig { trip_cut_m: CUT.distance_m, trip_cut_s: CUT.time_s, ..servers::config(folder) }
+}
+
+/// A drive whose every frame has a fix, so that its map has a place on the earth.
+fn with_fixes(drive: &Drive) -> Drive {
+    let frames = drive.frames.iter().enumerate().map(|(index, frame)| {
+        let latitude_deg = 48.0 + index as f64 * 1e-5;
+        let (longitude_deg, height_m) = (11.0 + (index % 7) as f64 * 1e-6, 500.0);
+        let (horizontal_sigma_m, vertical_sigma_m) = (0.7, 1.5);
+        let gnss = Some(GnssFix {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+            horizontal_sigma_m,
+            vertical_sigma_m,
+            yaw_enu_rad: None,
+        });
+        let parts = FrameParts {
+            sequence: frame.sequence(),
+            time: frame.time(),
+            odometry: frame.odometry().clone(),
+            gnss,
+            detections: frame.detections().to_vec(),
+        };
+        Frame::new(parts, &FrameLimits::default()).unwrap()
+    });
+    Drive { frames: frames.collect(), ..drive.clone() }
+}
+
+/// The part of a drive that lies beyond both of its ends.
+fn middle(drive: &Drive) -> Drive {
+    let (mut ends, mut first, mut last) = (TripEnds::default(), None, None);
+    for frame in &drive.frames {
+        match ends.arrive(&CUT, frame) {
+            Passage::Cut => assert_eq!(first, None, "the drive does not stop"),
+            Passage::Held { mapped_through } => {
+                first.get_or_insert(frame.sequence());
+                last = mapped_through.or(last);
+            }
+        }
+    }
+    let within = |frame: &&Frame| Some(frame.sequence()) >= first && Some(frame.sequence()) <= last;
+    let frames: Vec<_> = drive.frames.iter().filter(within).cloned().collect();
+    assert!(frames.len() >= 40 && drive.frames.len() - frames.len() >= 40, "{} of the drive are left", frames.len());
+    Drive { frames, ..drive.clone() }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn where_a_trip_sets_out_and_arrives_is_in_no_map_and_every_frame_is_acked() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(cutting(folder.path())).await.unwrap();
+    let drive = with_fixes(&drives::simulated(5, 160));
+    let (mut stream, accepted) = RawStream::started(&server.url(), drive.wire_start()).await;
+    let list = async || http::get(format!("{}/sessions", server.url())).await.unwrap().text().await.unwrap();
+    for frame in &drive.frames[..10] {
+        stream.send_frame(encode::frame(frame)).await;
+    }
+    stream.acked(10).await;
+    assert!(list().await.contains("\"total\":0"), "readers know that a vehicle sets out");
+    assert!(!on_disk(folder.path(), &trace_of_frame(&drive.frames[5])), "a frame that was cut was kept");
+    for frame in &drive.frames[10..] {
+        stream.send_frame(encode::frame(frame)).await;
+    }
+    stream.acked(160).await;
+    stream.send(Message::End(v1::SessionEnd {})).await;
+    stream.end().await.unwrap();
+    assert_same_map(&map_bytes(&server.url(), &accepted.session_id).await, &middle(&drive));
+    assert!(list().await.contains("\"georeferenced\":true"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cut_drive_that_kills_interrupt_anywhere_gives_the_same_map_and_its_ends_leave_the_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = with_fixes(&drives::simulated(5, 160));
+    let arguments = [&CUT_ARGUMENTS[..], &["--trip-erase-s", "1"]].concat();
+    let mut session = String::new();
+    let mut sent = 0;
+    // Into the start, beyond it, into the part that is held, and through snapshots.
+    for until in [1, 7, 31, 33, 60, 61, 99, 140, 160] {
+        let server = LoggingServer::start(folder.path(), &arguments);
+        let mut stream = RawStream::open(&server.url).await;
+        let accepted = stream.start(drive.wire_start()).await;
+        assert_eq!(accepted.resume_after_sequence.unwrap_or(0), sent as u64, "what was acked is had");
+        // One that the server knows comes again.
+        for frame in &drive.frames[usize::saturating_sub(sent, 1)..until] {
+            stream.send_frame(encode::frame(frame)).await;
+        }
+        stream.acked(until as u64).await;
+        sent = until;
+        session = accepted.session_id;
+        server.stop();
+    }
+    let server = LoggingServer::start(folder.path(), &arguments);
+    upload(&server.url, drive.wire_start(), vec![], true).await.unwrap();
+    assert_same_map(&map_bytes(&server.url, &session).await, &middle(&drive));
+    for frame in [&drive.frames[2], &drive.frames[158]] {
+        wait_until("an end to be erased", || !on_disk(folder.path(), &trace_of_frame(frame)));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_end_of_a_trip_that_is_never_ended_is_erased_all_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = ServerConfig { trip_stop_s: 1.0, trip_erase_s: 1, unload_after_s: 0, ..cutting(folder.path()) };
+    let server = Server::start(config).await.unwrap();
+    let drive = drives::simulated(5, 160);
+    upload(&server.url(), drive.wire_start(), wire(&drive), false).await.unwrap();
+    assert!(on_disk(folder.path(), &trace_of_frame(&drive.frames[158])));
+    wait_until("the end to be erased", || !on_disk(folder.path(), &trace_of_frame(&drive.frames[158])));
 }

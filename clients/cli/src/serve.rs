@@ -174,6 +174,9 @@ pub struct ServeArgs {
     /// [env: LANEMAP_TRIP_STOP_S] [default: 1800.0]
     #[arg(long, value_name = "S")]
     trip_stop_s: Option<f64>,
+    /// Time after which what was cut has left the store's files, seconds [env: LANEMAP_TRIP_ERASE_S] [default: 3600]
+    #[arg(long, value_name = "S")]
+    trip_erase_s: Option<u64>,
 }
 
 impl ServeArgs {
@@ -222,6 +225,7 @@ impl ServeArgs {
             trip_cut_m: self.trip_cut_m,
             trip_cut_s: self.trip_cut_s,
             trip_stop_s: self.trip_stop_s,
+            trip_erase_s: self.trip_erase_s,
         }
     }
 }

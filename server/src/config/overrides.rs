@@ -93,6 +93,8 @@ pub struct ConfigOverrides {
     pub trip_cut_s: Option<f64>,
     /// See [`ServerConfig::trip_stop_s`].
     pub trip_stop_s: Option<f64>,
+    /// See [`ServerConfig::trip_erase_s`].
+    pub trip_erase_s: Option<u64>,
 }
 
 impl ConfigOverrides {
@@ -140,6 +142,7 @@ impl ConfigOverrides {
         set(&mut settings.trip_cut_m, self.trip_cut_m);
         set(&mut settings.trip_cut_s, self.trip_cut_s);
         set(&mut settings.trip_stop_s, self.trip_stop_s);
+        set(&mut settings.trip_erase_s, self.trip_erase_s);
     }
 }
 

@@ -2,11 +2,10 @@
 
 use std::{thread, time::Instant};
 
-use lanemap_core::Sequence;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
-use super::{JournalError, JournalFrame, SessionRecord, erasure::Forget, store::Store, store::StoreBatch};
+use super::{JournalError, JournalFrame, SessionRecord, Snapshot, erasure::Forget, store::Store, store::StoreBatch};
 use crate::{session::SessionId, telemetry};
 
 /// Where a commit's outcome goes.
@@ -20,7 +19,9 @@ pub(super) enum Commit {
     /// A session's record.
     Record { record: SessionRecord, done: Done },
     /// A snapshot, and the frames that it covers are removed.
-    Snapshot { session: SessionId, covered: Sequence, bytes: Vec<u8>, done: Done },
+    Snapshot { session: SessionId, snapshot: Snapshot, done: Done },
+    /// What was removed up to `since` has left the disk.
+    Erased { since: Vec<u8>, done: Done },
     /// How far a drive has come whose frames are cut.
     CutMark { session: SessionId, mark: Vec<u8>, done: Done },
     /// All that there is of some drives is removed.
@@ -124,6 +125,10 @@ fn add(batch: &mut StoreBatch<'_>, commit: Commit) -> Result<(usize, Done), (Jou
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),
         },
+        Commit::Erased { since, done } => match batch.erased(&since) {
+            Ok(()) => Ok((0, done)),
+            Err(error) => Err((error, done)),
+        },
         Commit::CutMark { session, mark, done } => {
             batch.put_cut_mark(session, mark);
             Ok((0, done))
@@ -132,7 +137,7 @@ fn add(batch: &mut StoreBatch<'_>, commit: Commit) -> Result<(usize, Done), (Jou
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),
         },
-        Commit::Snapshot { session, covered, bytes, done } => match batch.put_snapshot(session, covered, bytes) {
+        Commit::Snapshot { session, snapshot, done } => match batch.put_snapshot(session, snapshot) {
             Ok(()) => Ok((0, done)),
             Err(error) => Err((error, done)),
         },

@@ -7,6 +7,7 @@ use std::{
     collections::BTreeSet,
     fs, io,
     path::{Path, PathBuf},
+    time::{SystemTime, UNIX_EPOCH},
 };
 
 use fjall::Keyspace;
@@ -62,25 +63,17 @@ impl Journal {
         self.commit(|done| Commit::Forget { forget, done }).await
     }
 
-    /// Makes everything that was removed leave the disk.
+    /// Makes what was removed leave the disk, where anything was; whether it was. What was removed before a crash counts.
     ///
     /// # Errors
-    /// The store failed, or has no room to be written anew: [`Journal::erasure_is_due`] stays.
-    pub async fn erase(&self) -> Result<(), JournalError> {
+    /// The store failed, or has no room to be written anew: it is still to be done.
+    pub async fn erase(&self) -> Result<bool, JournalError> {
+        let Some(since) = self.store.erasure_due()? else { return Ok(false) };
         let store = self.store.clone();
-        let erasing = tokio::task::spawn_blocking(move || {
-            store.erase_deleted()?;
-            Ok(store.facts.remove(ERASURE_DUE)?)
-        });
-        erasing.await.unwrap_or_else(|error| Err(JournalError::Store(format!("erasing: {error}"))))
-    }
-
-    /// Whether something was removed that has not left the disk, e.g. because of a crash between.
-    ///
-    /// # Errors
-    /// The store cannot be read.
-    pub fn erasure_is_due(&self) -> Result<bool, JournalError> {
-        Ok(self.store.facts.contains_key(ERASURE_DUE)?)
+        let erasing = tokio::task::spawn_blocking(move || store.erase_deleted());
+        erasing.await.map_err(|error| JournalError::Store(format!("erasing: {error}")))??;
+        self.commit(|done| Commit::Erased { since, done }).await?;
+        Ok(true)
     }
 
     /// The drives that were forgotten.
@@ -111,17 +104,32 @@ impl StoreBatch<'_> {
         for drive in &forget.outdated {
             self.batch.remove(&self.store.forgotten, postcard::to_stdvec(drive).map_err(encode_error)?);
         }
-        self.erasure_due();
+        self.set_erasure_due();
         Ok(())
     }
 
     /// What this batch removes must leave the disk, even after a crash.
-    pub(super) fn erasure_due(&mut self) {
-        self.batch.insert(&self.store.facts, ERASURE_DUE, []);
+    pub(super) fn set_erasure_due(&mut self) {
+        // Any value that it did not have before.
+        let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        self.batch.insert(&self.store.facts, ERASURE_DUE, since_epoch.as_nanos().to_le_bytes());
+    }
+
+    /// What was removed up to `since` has left the disk.
+    pub(super) fn erased(&mut self, since: &[u8]) -> Result<(), JournalError> {
+        if self.store.erasure_due()?.as_deref() == Some(since) {
+            self.batch.remove(&self.store.facts, ERASURE_DUE);
+        }
+        Ok(())
     }
 }
 
 impl Store {
+    /// Since when something that was removed is to leave the disk.
+    fn erasure_due(&self) -> Result<Option<Vec<u8>>, JournalError> {
+        Ok(self.facts.get(ERASURE_DUE)?.map(|since| since.to_vec()))
+    }
+
     /// Writes all logs and tables anew without what was deleted. Other writes may go on meanwhile. Takes a second, and
     /// as long as it takes to write every table.
     pub(super) fn erase_deleted(&self) -> Result<(), JournalError> {
@@ -179,7 +187,10 @@ fn filler(number: u64) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{journal::JournalFrame, session::SessionId};
+    use crate::{
+        journal::{JournalFrame, Snapshot},
+        session::SessionId,
+    };
     use lanemap_core::Sequence;
 
     /// Whether a file below `folder` holds `pattern`.
@@ -202,7 +213,8 @@ mod tests {
         let mut batch = store.batch();
         for (session, bytes) in [(gone, &gone_bytes), (kept, &kept_bytes)] {
             batch.put_frame(session, JournalFrame { sequence: Sequence(1), bytes: bytes.clone() });
-            batch.put_snapshot(session, Sequence(0), bytes.clone()).unwrap();
+            let snapshot = Snapshot { covered: Sequence(0), state: bytes.clone(), erase: false };
+            batch.put_snapshot(session, snapshot).unwrap();
         }
         batch.commit().unwrap();
         store.settle().unwrap();

@@ -49,7 +49,7 @@ pub(super) fn rename(store: &Store, mut batch: StoreBatch<'_>, pseudonyms: &Pseu
         batch.put_record(&with_pseudonyms(record, pseudonyms))?;
         renamed += 1;
     }
-    batch.erasure_due();
+    batch.set_erasure_due();
     batch.commit()?;
     store.database.delete_keyspace(named)?;
     tracing::info!(drives = renamed, "the store's drives have pseudonyms now");

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use fjall::{Database, Keyspace, KeyspaceCreateOptions, OwnedWriteBatch, PersistMode};
 use lanemap_core::{Frame, Sequence};
 
-use super::{JournalError, JournalFrame, SessionRecord, decode_error};
+use super::{JournalError, JournalFrame, SessionRecord, Snapshot, decode_error};
 use crate::{privacy::pseudonym::KeyFingerprint, session::SessionId};
 
 /// Key of the privacy key's fingerprint in the keyspace `facts`.
@@ -123,17 +123,16 @@ impl StoreBatch<'_> {
     }
 
     /// Puts the snapshot and removes the frames that it covers.
-    pub(super) fn put_snapshot(
-        &mut self,
-        session: SessionId,
-        covered: Sequence,
-        bytes: Vec<u8>,
-    ) -> Result<(), JournalError> {
+    pub(super) fn put_snapshot(&mut self, session: SessionId, snapshot: Snapshot) -> Result<(), JournalError> {
+        let Snapshot { covered, state, erase } = snapshot;
         let covered = frame_key(session, Sequence(0))..=frame_key(session, covered);
         for entry in self.store.frames.range(covered) {
             self.batch.remove(&self.store.frames, entry.key()?);
         }
-        self.batch.insert(&self.store.snapshots, session.to_key(), bytes);
+        if erase {
+            self.set_erasure_due();
+        }
+        self.batch.insert(&self.store.snapshots, session.to_key(), state);
         self.batch.remove(&self.store.cuts, session.to_key());
         Ok(())
     }

@@ -90,8 +90,14 @@ impl TripCut {
         far && at.time.seconds_since(from.time) >= self.time_s
     }
 
-    fn is_stop(&self, from: &Place, at: &Place) -> bool {
+    /// Whether a vehicle that sent nothing between has ended its trip.
+    fn is_pause(&self, from: &Place, at: &Place) -> bool {
         at.time.seconds_since(from.time) > self.stop_s
+    }
+
+    /// Whether a vehicle that has not left has ended its trip.
+    fn is_stay(&self, from: &Place, at: &Place) -> bool {
+        at.time.seconds_since(from.time) > self.time_s + self.stop_s
     }
 }
 
@@ -115,14 +121,14 @@ impl TripEnds {
     }
 
     fn stays(&self, rule: &TripCut, at: &Place) -> bool {
-        let silent = self.track.is_some_and(|track| rule.is_stop(&track.at, at));
+        let silent = self.track.is_some_and(|track| rule.is_pause(&track.at, at));
         silent
             || match &self.phase {
                 Phase::Standing => true,
                 Phase::SettingOut { from } => !rule.is_beyond(from, at),
                 Phase::UnderWay { held } => {
                     let oldest = held.front().filter(|(_, from)| !rule.is_beyond(from, at));
-                    oldest.is_some_and(|(_, from)| held.len() >= MOST_HELD || rule.is_stop(from, at))
+                    oldest.is_some_and(|(_, from)| held.len() >= MOST_HELD || rule.is_stay(from, at))
                 }
             }
     }
@@ -134,7 +140,7 @@ impl TripEnds {
             return Passage::Held { mapped_through: Some(sequence) };
         }
         let track = Track::advanced(self.track.as_ref(), frame);
-        let silent = self.track.is_some_and(|before| rule.is_stop(&before.at, &track.at));
+        let silent = self.track.is_some_and(|before| rule.is_pause(&before.at, &track.at));
         let stays = self.stays(rule, &track.at);
         self.track = Some(track);
         if stays {

@@ -27,7 +27,7 @@ use crate::{
     config::ServerConfig,
     error::Error,
     ingest::{Outbox, Refusal},
-    journal::{Journal, JournalError, JournalFrame, frame_bytes},
+    journal::{Journal, JournalError, JournalFrame, Snapshot, frame_bytes},
     privacy::Pseudonyms,
     telemetry,
 };
@@ -421,8 +421,10 @@ impl Actor {
         let Some(covered) = self.drive.covered().filter(|_| self.frames_since_snapshot > 0) else {
             return Ok(());
         };
-        let bytes = self.drive.snapshot()?;
-        self.surroundings.journal.put_snapshot(self.record.id, covered, bytes).await?;
+        // Frames of a trip's ends, and where it set out.
+        let erase = self.drive.holds_back();
+        let snapshot = Snapshot { covered, state: self.drive.snapshot()?, erase };
+        self.surroundings.journal.put_snapshot(self.record.id, snapshot).await?;
         self.frames_since_snapshot = 0;
         Ok(())
     }

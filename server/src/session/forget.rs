@@ -82,15 +82,24 @@ impl SessionRegistry {
         Ok(count)
     }
 
-    /// Finishes a deletion that a crash interrupted.
-    pub(crate) async fn finish_forgetting(&self) -> Result<(), Error> {
-        let _alone = self.shared.forgetting.lock().await;
-        let journal = &self.shared.surroundings.journal;
-        if journal.erasure_is_due()? {
-            journal.erase().await?;
-            tracing::info!("a deletion that was interrupted is finished");
+    /// Makes what was cut off trips leave the disk every `trip_erase_s`, and what a deletion left that a crash
+    /// interrupted at once.
+    pub(crate) async fn keep_erasing(self) {
+        loop {
+            let erased = {
+                let _alone = self.shared.forgetting.lock().await;
+                self.shared.surroundings.journal.erase().await
+            };
+            match erased {
+                Ok(true) => tracing::info!("what was deleted has left the disk"),
+                Ok(false) => {}
+                Err(error) => tracing::error!(%error, "what was deleted cannot leave the disk"),
+            }
+            tokio::select! {
+                () = tokio::time::sleep(self.shared.surroundings.config.trip_erase()) => {}
+                () = self.shared.surroundings.shutdown.cancelled() => return,
+            }
         }
-        Ok(())
     }
 
     async fn forget_held(&self, drives: &[ForgottenDrive], outdated: Vec<DrivePseudonym>) -> Result<usize, Error> {

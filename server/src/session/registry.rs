@@ -30,7 +30,7 @@ use super::{
 use crate::{
     error::Error,
     ingest::{Outbox, Refusal, decode::Start},
-    journal::{Journal, JournalError},
+    journal::JournalError,
     privacy::{DrivePseudonym, Pseudonyms, VehiclePseudonym},
     telemetry,
 };

@@ -1,10 +1,10 @@
 //! `lanemap forget`: has a service delete what it has of a vehicle, or of one drive.
 
-use std::process::ExitCode;
+use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::Context;
 use clap::Args;
-use lanemap_proto::v1::{ForgetRequest, admin_service_client::AdminServiceClient};
+use lanemap_client::{AdminClient, ConnectOptions, Credentials, IdentityFiles, Token};
 
 /// Whom to forget, and where.
 #[derive(Args, Debug)]
@@ -21,16 +21,40 @@ pub struct ForgetArgs {
     /// One drive of the vehicle; without it, all of them
     #[arg(long, value_name = "ID")]
     drive: Option<String>,
+    /// File of a bearer token of scope admin
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Certificates that sign the service's, PEM, for an address that begins with https
+    #[arg(long, value_name = "FILE")]
+    ca_file: Option<PathBuf>,
+    /// The operator's own certificate, PEM, for a service that asks for one
+    #[arg(long, value_name = "FILE", requires = "key_file")]
+    cert_file: Option<PathBuf>,
+    /// Its private key, PEM
+    #[arg(long, value_name = "FILE", requires = "cert_file")]
+    key_file: Option<PathBuf>,
+}
+
+impl ForgetArgs {
+    fn credentials(&self) -> Credentials {
+        let identity = self.cert_file.clone().zip(self.key_file.clone());
+        Credentials {
+            ca: self.ca_file.clone(),
+            identity: identity.map(|(cert, key)| IdentityFiles { cert, key }),
+            token: self.token_file.clone().map(Token::File),
+            ..Credentials::default()
+        }
+    }
 }
 
 /// Asks for the deletion and waits until the data are gone from the disk.
 #[tokio::main]
 pub async fn run(args: &ForgetArgs) -> anyhow::Result<ExitCode> {
-    let client = AdminServiceClient::connect(args.server.clone()).await;
-    let mut client = client.with_context(|| format!("{} cannot be reached", args.server))?;
-    let request =
-        ForgetRequest { fleet_id: args.fleet.clone(), vehicle_id: args.vehicle.clone(), drive_id: args.drive.clone() };
-    let answer = client.forget(request).await.context("nothing was deleted, or it is not finished: try again")?;
-    println!("deleted: {} drives", answer.into_inner().drives);
+    let options = ConnectOptions { credentials: args.credentials(), ..ConnectOptions::default() };
+    let client = AdminClient::connect(&args.server, &options).await;
+    let client = client.with_context(|| format!("{} cannot be reached", args.server))?;
+    let drives = client.forget(&args.fleet, &args.vehicle, args.drive.as_deref()).await;
+    let drives = drives.context("nothing was deleted, or it is not finished; it is safe to try again")?;
+    println!("deleted: {drives} drives");
     Ok(ExitCode::SUCCESS)
 }

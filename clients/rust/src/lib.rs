@@ -35,6 +35,7 @@
 //! # }
 //! ```
 
+mod admin;
 mod backlog;
 mod connection;
 mod credentials;
@@ -47,6 +48,7 @@ mod session;
 mod spool;
 mod start;
 
+pub use admin::AdminClient;
 pub use credentials::{Credentials, IdentityFiles, Login, Token};
 pub use error::ClientError;
 pub use event::{Event, Events, LocalMap, VehiclePose};

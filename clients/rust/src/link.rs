@@ -10,7 +10,7 @@ use tokio::{sync::mpsc, time::timeout};
 use tonic::Status;
 
 use crate::{credentials::Credentials, error::ClientError};
-use grpc::GrpcLink;
+pub(crate) use grpc::GrpcLink;
 use zenoh::{ACCEPTED_WITHIN, ZenohAnswers, ZenohLink};
 
 /// Messages between the session and the network.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use lanemap_proto::v1::{self, ingest_service_client::IngestServiceClient};
+use lanemap_proto::v1::{self, admin_service_client::AdminServiceClient, ingest_service_client::IngestServiceClient};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{
@@ -64,6 +64,14 @@ impl GrpcLink {
         }
         let mut client = IngestServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_ANSWER_BYTES);
         Ok(client.stream_observations(request).await?.into_inner())
+    }
+
+    pub(crate) async fn forget(&self, request: v1::ForgetRequest) -> Result<v1::ForgetResponse, ClientError> {
+        let mut request = Request::new(request);
+        if let Some(token) = self.credentials.bearer().await? {
+            request.metadata_mut().insert("authorization", bearer(&token)?);
+        }
+        Ok(AdminServiceClient::new(self.channel.clone()).forget(request).await?.into_inner())
     }
 
     pub(crate) fn may_renew_token(&self) -> bool {

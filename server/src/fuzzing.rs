@@ -4,6 +4,7 @@ use lanemap_core::{Frame, Preset, Sensor, Sequence};
 
 use crate::{
     journal::frame_bytes,
+    privacy::TripCut,
     session::{
         SessionSetup,
         drive::{Admission, Drive},
@@ -29,7 +30,7 @@ impl FuzzedDrive {
     /// A drive that has had no frame.
     #[must_use]
     pub fn new(preset: Preset, sensor: Sensor) -> Self {
-        Self(Drive::new(&SessionSetup { preset, sensor }))
+        Self(Drive::new(&SessionSetup { preset, sensor }, TripCut::default()))
     }
 
     /// Offers a frame as a stream does.
@@ -39,7 +40,8 @@ impl FuzzedDrive {
                 self.0.map(frame);
                 Offered::New
             }
-            Admission::Repeated => Offered::Repeated,
+            // Nothing is cut here.
+            Admission::Cut | Admission::Repeated => Offered::Repeated,
             Admission::Refused(_) => Offered::Refused,
         }
     }
@@ -49,7 +51,10 @@ impl FuzzedDrive {
     /// # Errors
     /// The refusal in words.
     pub fn replay(&mut self, frame: &Frame) -> Result<(), String> {
-        self.0.replay(frame).map_err(|refusal| refusal.to_string())
+        if self.0.replay(frame).map_err(|refusal| refusal.to_string())? {
+            self.0.map(frame);
+        }
+        Ok(())
     }
 
     /// The state as bytes.
@@ -65,7 +70,7 @@ impl FuzzedDrive {
     /// # Errors
     /// It does not decode.
     pub fn restore(bytes: &[u8]) -> Result<Self, String> {
-        Drive::restore(bytes).map(Self).map_err(|error| error.to_string())
+        Drive::restore(bytes, TripCut::default()).map(Self).map_err(|error| error.to_string())
     }
 
     /// The last frame admitted.

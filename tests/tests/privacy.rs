@@ -31,6 +31,7 @@ use lanemap_tests::{
     drives::{self, Drive, assert_same_map},
     http,
     raw_stream::RawStream,
+    raw_zenoh::{self, RawZenohStream},
     servers::{self, ServerProcess, map_bytes},
 };
 use tonic::{Code, Status};
@@ -280,8 +281,10 @@ async fn all_answers(url: &str, session: &str) -> Vec<(String, String)> {
 #[tokio::test(flavor = "multi_thread")]
 async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_fleet_or_its_drive() {
     const DRIVE: &str = "drive-h5v1t6";
+    const DRIVE_OVER_ZENOH: &str = "drive-n2b8y4";
     let folder = tempfile::tempdir().unwrap();
-    let server = LoggingServer::start(folder.path(), &[]);
+    let endpoint = raw_zenoh::free_endpoint();
+    let server = LoggingServer::start(folder.path(), &["--zenoh-mode", "router", "--zenoh-listen", &endpoint]);
     let url = server.url.clone();
     let drive = drives::simulated(5, 30);
     let begin = || start(&drive, VEHICLE, DRIVE);
@@ -309,6 +312,16 @@ async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_flee
     let paper = v1::MapperPreset::Paper.into();
     upload(&url, v1::SessionStart { preset: paper, ..begin() }, vec![], false).await.unwrap_err();
     upload(&url, begin(), wire(&drive)[..2].to_vec(), false).await.unwrap();
+    // Over zenoh, whose keys name the vehicle: a drive, and bytes that are no message.
+    let session = raw_zenoh::connect(&endpoint).await;
+    let begin_over_zenoh = start(&drive, VEHICLE, DRIVE_OVER_ZENOH);
+    let (mut zenoh, _) = RawZenohStream::started(&session, begin_over_zenoh).await;
+    zenoh.stream(&drive.frames, 16).await;
+    zenoh.end_drive().await;
+    let mut wrong = RawZenohStream::open(&session, FLEET, VEHICLE).await;
+    wrong.send_bytes(b"no message".to_vec()).await;
+    wrong.answer().await;
+    session.close().await.unwrap();
     let mut maps = MapServiceClient::connect(url.clone()).await.unwrap();
     let told = maps.list_sessions(v1::ListSessionsRequest::default()).await.unwrap();
     let answers = all_answers(&url, &accepted.session_id).await;
@@ -316,7 +329,7 @@ async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_flee
     let log = server.stop();
 
     assert!(log.len() > 10_000, "little was logged");
-    for name in [FLEET, VEHICLE, DRIVE, "drive-that-never-was"] {
+    for name in [FLEET, VEHICLE, DRIVE, DRIVE_OVER_ZENOH, "drive-that-never-was"] {
         for (path, answer) in &answers {
             assert!(!answer.contains(name), "{path} names {name}");
         }

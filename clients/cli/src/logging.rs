@@ -3,11 +3,16 @@
 use std::io::IsTerminal;
 
 use clap::{Args, ValueEnum};
-use tracing_subscriber::{EnvFilter, Layer, layer::SubscriberExt, util::SubscriberInitExt};
+use tracing::{Level, Metadata};
+use tracing_subscriber::{
+    EnvFilter, Layer,
+    filter::{FilterExt, filter_fn},
+    layer::SubscriberExt,
+    util::SubscriberInitExt,
+};
 
-/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business, and zenoh's notes and
-/// warnings name keys and certificates, which name vehicles.
-const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn,zenoh=error";
+/// What is logged unless `RUST_LOG` says otherwise: the store's own notes are not a user's business.
+const DEFAULT_LOG: &str = "info,fjall=warn,lsm_tree=warn,value_log=warn";
 
 /// Where the service tells what it does.
 #[derive(Args, Clone, Debug, Default)]
@@ -79,6 +84,12 @@ where
     }
 }
 
-fn filter() -> EnvFilter {
-    EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_LOG))
+fn filter<S>() -> impl tracing_subscriber::layer::Filter<S> {
+    let wanted = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_LOG));
+    wanted.and(filter_fn(names_no_vehicle))
+}
+
+/// Whatever is asked for: zenoh logs keys, and vehicles' keys bear their names.
+fn names_no_vehicle(metadata: &Metadata<'_>) -> bool {
+    !metadata.target().starts_with("zenoh") || *metadata.level() == Level::ERROR
 }

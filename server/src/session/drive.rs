@@ -242,7 +242,7 @@ impl Drive {
     }
 
     /// Takes a frame from the journal, which was admitted when it was put there; whether it may be mapped at once.
-    fn replay(&mut self, frame: &Frame) -> Result<bool, Refusal> {
+    pub(crate) fn replay(&mut self, frame: &Frame) -> Result<bool, Refusal> {
         if self.cut.is_on() && Some(frame.sequence()) <= self.last_sequence() {
             // It was held when the snapshot was made.
             return Ok(false);

@@ -26,20 +26,20 @@ pub struct ForgetArgs {
     token_file: Option<PathBuf>,
     /// Certificates that sign the service's, PEM, for an address that begins with https
     #[arg(long, value_name = "FILE")]
-    ca_file: Option<PathBuf>,
+    ca: Option<PathBuf>,
     /// The operator's own certificate, PEM, for a service that asks for one
-    #[arg(long, value_name = "FILE", requires = "key_file")]
-    cert_file: Option<PathBuf>,
+    #[arg(long, value_name = "FILE", requires = "key")]
+    cert: Option<PathBuf>,
     /// Its private key, PEM
-    #[arg(long, value_name = "FILE", requires = "cert_file")]
-    key_file: Option<PathBuf>,
+    #[arg(long, value_name = "FILE", requires = "cert")]
+    key: Option<PathBuf>,
 }
 
 impl ForgetArgs {
     fn credentials(&self) -> Credentials {
-        let identity = self.cert_file.clone().zip(self.key_file.clone());
+        let identity = self.cert.clone().zip(self.key.clone());
         Credentials {
-            ca: self.ca_file.clone(),
+            ca: self.ca.clone(),
             identity: identity.map(|(cert, key)| IdentityFiles { cert, key }),
             token: self.token_file.clone().map(Token::File),
             ..Credentials::default()

@@ -178,3 +178,38 @@ fn zstd_decoder(data: &[u8]) -> Result<impl Read + '_, String> {
     decoder.window_log_max(MAX_ZSTD_WINDOW_LOG).map_err(|error| error.to_string())?;
     Ok(decoder)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chunk_of(compression: &str, says_bytes: u64, data: &[u8]) -> Result<Vec<u8>, String> {
+        let header = ChunkHeader {
+            message_start_time: 0,
+            message_end_time: 0,
+            uncompressed_size: says_bytes,
+            uncompressed_crc: 0,
+            compression: compression.to_owned(),
+            compressed_size: data.len() as u64,
+        };
+        content(&header, data)
+    }
+
+    #[test]
+    fn a_chunk_that_is_a_bomb_costs_what_its_header_says_and_no_more() {
+        let bomb = zstd::encode_all(std::io::repeat(0).take(32 << 20), 3).unwrap();
+        assert!(bomb.len() < 32 * 1024, "{}", bomb.len());
+        let honest = chunk_of("zstd", 1 << 30, &bomb).unwrap_err();
+        assert_eq!(honest, "says that it decompresses to 1073741824 bytes, limit 67108864");
+        let lying = chunk_of("zstd", 1000, &bomb).unwrap_err();
+        assert_eq!(lying, "does not decompress: more than the 1000 bytes that its header says");
+    }
+
+    #[test]
+    fn a_chunk_that_does_not_decompress_or_holds_another_count_is_refused() {
+        assert!(chunk_of("zstd", 10, b"no zstd").unwrap_err().starts_with("does not decompress"));
+        assert!(chunk_of("lz4", 10, b"no lz4 ").unwrap_err().starts_with("does not decompress"));
+        assert_eq!(chunk_of("", 9, b"eight by").unwrap_err(), "does not decompress: 8 bytes, its header says 9");
+        assert!(chunk_of("snappy", 9, b"").unwrap_err().contains("\"snappy\""));
+    }
+}

@@ -1,5 +1,5 @@
-//! Promise: a Rust client, a Python client over gRPC and a Python client over zenoh stream at the same time; whatever
-//! happens to their connections and to themselves leaves no trace in the maps.
+//! Promise: a Rust client, a Python client over gRPC and a Python client over zenoh stream at the same time, through TLS;
+//! whatever happens to their connections and to themselves leaves no trace in the maps.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
 
@@ -12,19 +12,20 @@ use std::{
 };
 
 use lanemap_client::{
-    ClientError, ConnectOptions, IngestClient, Reconnect, Session, SessionStart, SpoolError, SpoolOptions,
-    SpooledDrive, WhenFull,
+    ClientError, ConnectOptions, Credentials, IdentityFiles, IngestClient, MapClient, Reconnect, Session, SessionStart,
+    SpoolError, SpoolOptions, SpooledDrive, Token, WhenFull,
 };
 use lanemap_server::{RunningServer, Server, ServerConfig, config::ZenohMode};
 use lanemap_tests::{
+    authorities::TlsFolder,
     drives::{self, Drive, assert_same_map},
-    http,
     proxy::{Fault, Proxy},
     python::{self, PythonClient, PythonRun},
     raw_zenoh::free_endpoint,
     servers,
+    tokens::{self, TokenIssuer},
 };
-use serde_json::Value;
+use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::time::timeout;
 
@@ -43,6 +44,54 @@ struct Service {
     server: RunningServer,
     zenoh: String,
     folder: TempDir,
+    tls: Option<VehicleTls>,
+}
+
+/// What a vehicle needs to know where everything is encrypted, and who is who is known by certificates.
+struct VehicleTls {
+    files: TlsFolder,
+    ca: PathBuf,
+    identity: IdentityFiles,
+    issuer: TokenIssuer,
+}
+
+impl VehicleTls {
+    /// Certificates for the vehicle that streams [`Drive::start`].
+    fn new(folder: &Path) -> Self {
+        let files = TlsFolder::new(folder);
+        let vehicle = files.vehicles.vehicle_by_common_name("test-fleet", "vehicle-under-test", 7);
+        let identity = IdentityFiles {
+            cert: files.write("vehicle.crt", &vehicle.certificate),
+            key: files.write("vehicle.key", &vehicle.key),
+        };
+        let ca = files.write("servers-ca.crt", &files.servers.pem());
+        Self { files, ca, identity, issuer: TokenIssuer::new("readers") }
+    }
+
+    fn credentials(&self) -> Credentials {
+        Credentials { ca: Some(self.ca.clone()), identity: Some(self.identity.clone()), ..Credentials::default() }
+    }
+
+    /// A reader of maps, who is known by a token.
+    fn reader(&self) -> Credentials {
+        let token = self.issuer.token(json!({ "scope": "read" }));
+        Credentials { ca: Some(self.ca.clone()), token: Some(Token::Text(token)), ..Credentials::default() }
+    }
+
+    fn python_options(&self) -> Vec<String> {
+        let files = [("--ca", &self.ca), ("--cert", &self.identity.cert), ("--key", &self.identity.key)];
+        files.into_iter().flat_map(|(option, path)| [option.to_owned(), path.display().to_string()]).collect()
+    }
+
+    /// Settings of a server that knows the vehicle and the reader.
+    fn config(&self) -> ServerConfig {
+        ServerConfig {
+            zenoh_vehicles_file: Some(self.files.write("vehicles", "test-fleet/vehicle-under-test\n")),
+            token_keys_file: Some(self.files.write("keys.json", &TokenIssuer::jwks(&[&self.issuer]))),
+            token_issuer: Some(tokens::ISSUER.to_owned()),
+            ..self.files.config()
+        }
+    }
 }
 
 /// A client, and the way that it takes.
@@ -56,13 +105,35 @@ enum Vehicle {
 impl Service {
     async fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let zenoh = free_endpoint();
-        let config = ServerConfig {
-            zenoh_mode: ZenohMode::Router,
-            zenoh_listen: zenoh.parse().unwrap(),
-            ..servers::config(&folder.path().join("data"))
-        };
-        Self { server: Server::start(config).await.unwrap(), zenoh, folder }
+        let config = servers::config(&folder.path().join("data"));
+        Self::start_with(config, free_endpoint(), folder, None).await
+    }
+
+    /// With TLS and client certificates, and nothing without.
+    async fn start_secured() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let tls = VehicleTls::new(folder.path());
+        let zenoh = free_endpoint().replace("tcp/", "tls/");
+        Self::start_with(tls.config(), zenoh, folder, Some(tls)).await
+    }
+
+    async fn start_with(config: ServerConfig, zenoh: String, folder: TempDir, tls: Option<VehicleTls>) -> Self {
+        let config = ServerConfig { zenoh_mode: ZenohMode::Router, zenoh_listen: zenoh.parse().unwrap(), ..config };
+        Self { server: Server::start(config).await.unwrap(), zenoh, folder, tls }
+    }
+
+    fn credentials(&self) -> Credentials {
+        self.tls.as_ref().map(VehicleTls::credentials).unwrap_or_default()
+    }
+
+    /// `address` for gRPC and HTTP.
+    fn http_url(&self, address: SocketAddr) -> String {
+        format!("{}://{address}", if self.tls.is_some() { "https" } else { "http" })
+    }
+
+    /// `address` for zenoh.
+    fn zenoh_url(&self, address: SocketAddr) -> String {
+        format!("{}/{address}", if self.tls.is_some() { "tls" } else { "tcp" })
     }
 
     /// Where a vehicle's way ends.
@@ -77,10 +148,13 @@ impl Service {
     async fn map_streamed_by(&self, vehicle: Vehicle, address: SocketAddr, drive: &Drive) -> Vec<u8> {
         let folder = self.path(&drive.name);
         std::fs::create_dir(&folder).unwrap();
+        let python_options = self.tls.as_ref().map(VehicleTls::python_options).unwrap_or_default();
         let session = match vehicle {
-            Vehicle::RustOverGrpc => stream_by_rust(format!("http://{address}"), drive, &folder).await,
-            Vehicle::PythonOverGrpc => stream_by_python(&format!("http://{address}"), drive, &folder).await,
-            Vehicle::PythonOverZenoh => stream_by_python(&format!("tcp/{address}"), drive, &folder).await,
+            Vehicle::RustOverGrpc => stream_by_rust(self.http_url(address), self.credentials(), drive, &folder).await,
+            Vehicle::PythonOverGrpc => stream_by_python(&self.http_url(address), &python_options, drive, &folder).await,
+            Vehicle::PythonOverZenoh => {
+                stream_by_python(&self.zenoh_url(address), &python_options, drive, &folder).await
+            }
         };
         self.map(&session).await
     }
@@ -90,19 +164,25 @@ impl Service {
     }
 
     fn address(&self) -> SocketAddr {
-        self.server.url().trim_start_matches("http://").parse().unwrap()
+        self.server.address()
     }
 
     /// The bytes of `/sessions/{id}/lanes.pb`.
     async fn map(&self, session: &str) -> Vec<u8> {
-        let url = format!("{}/sessions/{session}/lanes.pb", self.server.url());
-        http::get(url).await.unwrap().error_for_status().unwrap().bytes().await.unwrap().to_vec()
+        let reader = self.tls.as_ref().map(VehicleTls::reader).unwrap_or_default();
+        let maps = MapClient::with(self.http_url(self.address()), &reader).await.unwrap();
+        maps.lane_map_bytes(session).await.unwrap()
     }
 }
 
 /// A client that survives what the proxy does.
-fn connect_options() -> ConnectOptions {
-    ConnectOptions { keep_alive: KEEP_ALIVE, open_timeout: 4 * KEEP_ALIVE, ..ConnectOptions::default() }
+fn connect_options(credentials: Credentials) -> ConnectOptions {
+    ConnectOptions { credentials, keep_alive: KEEP_ALIVE, open_timeout: 4 * KEEP_ALIVE }
+}
+
+/// A client of a service that is not there.
+async fn client_of_nobody() -> IngestClient {
+    IngestClient::offline("http://127.0.0.1:1", connect_options(Credentials::default())).await.unwrap()
 }
 
 fn spooled(drive: &Drive, folder: &Path) -> SessionStart {
@@ -112,8 +192,8 @@ fn spooled(drive: &Drive, folder: &Path) -> SessionStart {
 }
 
 /// Streams a drive by the Rust client; the session's name.
-async fn stream_by_rust(url: String, drive: &Drive, spool: &Path) -> String {
-    let client = IngestClient::offline(url, connect_options()).await.unwrap();
+async fn stream_by_rust(url: String, credentials: Credentials, drive: &Drive, spool: &Path) -> String {
+    let client = IngestClient::offline(url, connect_options(credentials)).await.unwrap();
     let (mut session, _events) = client.begin_session(spooled(drive, spool)).await.unwrap();
     send_rest(&mut session, drive).await;
     session.wait_opened().await.unwrap();
@@ -132,10 +212,11 @@ async fn send_rest(session: &mut Session, drive: &Drive) {
 }
 
 /// Streams a drive by the Python client; the session's name.
-async fn stream_by_python(url: &str, drive: &Drive, folder: &Path) -> String {
+async fn stream_by_python(url: &str, options: &[String], drive: &Drive, folder: &Path) -> String {
     let file = python::write_drive(drive, folder);
     let keep_alive = ["--keep-alive-s".to_owned(), KEEP_ALIVE.as_secs_f64().to_string()];
-    let run = PythonRun { url, drive: &file, spool: &folder.join("spool"), options: &keep_alive };
+    let options = [options, &keep_alive].concat();
+    let run = PythonRun { url, drive: &file, spool: &folder.join("spool"), options: &options };
     python_report(PythonClient::start(&run), drive).await
 }
 
@@ -146,9 +227,9 @@ async fn python_report(client: PythonClient, drive: &Drive) -> String {
     report["session"].as_str().unwrap().to_owned()
 }
 
-/// Streams three drives at once; their maps. One vehicle's way leads through a proxy that does everything it can.
+/// Streams three drives at once through TLS; their maps. One vehicle's way leads through a proxy that does everything it can.
 async fn maps_of_three(drives: &[Drive; 3], disturbed: Option<Vehicle>) -> [Vec<u8>; 3] {
-    let service = Service::start().await;
+    let service = Service::start_secured().await;
     let proxy = match disturbed {
         Some(vehicle) => Some(Proxy::start(service.address_for(vehicle), FAULT_EVERY_BYTES, &FAULTS).await),
         None => None,
@@ -200,7 +281,7 @@ async fn a_rust_client_over_zenoh_behind_a_proxy_that_cuts_delays_and_stalls_del
     let drive = drives::simulated(39, 200);
     let proxy = Proxy::start(service.address_for(Vehicle::PythonOverZenoh), FAULT_EVERY_BYTES, &FAULTS).await;
     let (url, spool) = (format!("tcp/{}", proxy.address()), service.path("spool"));
-    let id = timeout(PATIENCE, stream_by_rust(url, &drive, &spool)).await.unwrap();
+    let id = timeout(PATIENCE, stream_by_rust(url, Credentials::default(), &drive, &spool)).await.unwrap();
     assert_eq!(proxy.faults_begun(), FAULTS.len() as u64);
     assert_same_map(&service.map(&id).await, &drive);
 }
@@ -255,13 +336,14 @@ async fn a_spool_that_one_language_has_left_is_delivered_by_the_other() {
     let drive = drives::simulated(34, 80);
     let spool = service.path("spool");
     // Nobody listens there: the Rust client can only spool.
-    let nowhere = IngestClient::offline("http://127.0.0.1:1", connect_options()).await.unwrap();
+    let nowhere = client_of_nobody().await;
     let (mut session, _events) = nowhere.begin_session(spooled(&drive, &spool)).await.unwrap();
     for frame in &drive.frames[..40] {
         session.send(frame).await.unwrap();
     }
     session.abort().await;
-    let id = timeout(PATIENCE, stream_by_python(&service.server.url(), &drive, service.folder.path())).await.unwrap();
+    let id =
+        timeout(PATIENCE, stream_by_python(&service.server.url(), &[], &drive, service.folder.path())).await.unwrap();
     assert_same_map(&service.map(&id).await, &drive);
 }
 
@@ -269,7 +351,7 @@ async fn a_spool_that_one_language_has_left_is_delivered_by_the_other() {
 async fn drives_that_earlier_processes_left_are_delivered_and_ended_as_they_were() {
     let service = Service::start().await;
     let folder = service.path("spool");
-    let nowhere = IngestClient::offline("http://127.0.0.1:1", connect_options()).await.unwrap();
+    let nowhere = client_of_nobody().await;
     let drives = [drives::simulated(35, 40), drives::simulated(36, 40)];
     for drive in &drives {
         let (mut session, _events) = nowhere.begin_session(spooled(drive, &folder)).await.unwrap();
@@ -299,7 +381,7 @@ async fn a_full_spool_refuses_the_newest_frame_and_the_session_goes_on() {
         ..SpoolOptions::new(service.path("spool"))
     };
     let start = SessionStart { spool: Some(spool.clone()), ..spooled(&drive, &spool.folder) };
-    let nowhere = IngestClient::offline("http://127.0.0.1:1", connect_options()).await.unwrap();
+    let nowhere = client_of_nobody().await;
     let (mut session, _events) = nowhere.begin_session(start.clone()).await.unwrap();
     let mut taken = 0;
     let error = loop {

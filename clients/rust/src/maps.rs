@@ -54,8 +54,16 @@ impl MapClient {
     /// # Errors
     /// No such session, or a service that cannot be reached.
     pub async fn lane_map_message(&self, session: &str) -> Result<v1::LaneMap, ClientError> {
-        let bytes = self.get(&format!("/sessions/{session}/lanes.pb")).await?;
-        v1::LaneMap::decode(bytes.as_slice()).map_err(|error| ClientError::Protocol(error.to_string()))
+        v1::LaneMap::decode(self.lane_map_bytes(session).await?.as_slice())
+            .map_err(|error| ClientError::Protocol(error.to_string()))
+    }
+
+    /// The same, as it came: `/sessions/{id}/lanes.pb`.
+    ///
+    /// # Errors
+    /// No such session, or a service that cannot be reached.
+    pub async fn lane_map_bytes(&self, session: &str) -> Result<Vec<u8>, ClientError> {
+        self.get(&format!("/sessions/{session}/lanes.pb")).await
     }
 
     /// The newest lanes of a session, map frame, metres.

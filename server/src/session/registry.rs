@@ -350,7 +350,9 @@ async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) -> Opt
     });
     match read.await {
         Ok((published, holding)) => {
-            published.into_iter().for_each(|published| surroundings.sessions.publish(published));
+            if let Some(published) = published {
+                surroundings.sessions.publish(published);
+            }
             holding
         }
         Err(error) => {

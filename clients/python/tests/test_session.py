@@ -119,6 +119,20 @@ class Sessions(unittest.TestCase):
         with self.assertRaises(lanemap.SessionError):
             session.send(2, lanemap.Pose())
 
+    def test_a_spool_that_was_damaged_under_the_session_fails_it_instead_of_being_tried_for_ever(self):
+        session = self.session()
+        session.send(1, lanemap.Pose())
+        segment = session._backlog._spool._segments[-1]
+        segment.path.write_bytes(bytes(segment.size))
+        answers, requests = self.service.next_stream()
+        next(requests)
+        answers.put(accepted())
+        with self.assertRaises(StopIteration):
+            next(requests)
+        answers.put(None)
+        with self.assertRaisesRegex(lanemap.SpoolError, "not what was written"):
+            session.wait_acked(1, WITHIN_S)
+
     def test_pauses_grow_are_jittered_and_as_long_as_the_service_asks(self):
         reconnect = lanemap.Reconnect()
         for tries in range(40):

@@ -9,8 +9,9 @@
 A session outlives its connection, and with a spool its process: what is not acked is sent again.
 """
 
+from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials
-from ._session import Feed, LocalMap, Reconnect, Refusal, Session, Summary, VehiclePose
+from ._session import Reconnect, Session
 from ._spool import SpoolOptions, SpoolRecovery
 from ._values import Category, Detection, FieldOfView, GnssFix, Limits, Pose, Sensor
 from .errors import LanemapError, Refused, SessionError, SpoolError, SpoolFull

@@ -5,25 +5,21 @@ from __future__ import annotations
 import os
 import random
 import threading
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy.typing as npt
 
 from . import _values
 from ._backlog import Backlog, Leaving
-from ._link import Credentials, Link, link_to
+from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
+from ._link import Credentials, Link, Stream, link_to
 from ._spool import Spool, SpoolOptions, SpoolRecovery
-from ._values import Array, Detection, GnssFix, Limits, Pose, Preset, Sensor
-from .errors import LanemapError, Refused, SessionError, StreamBroken
+from ._values import Detection, GnssFix, Limits, Pose, Preset, Sensor
+from .errors import LanemapError, Refused, SessionError, SpoolError, StreamBroken
 from .v1 import ingest_service_pb2 as ingest
-from .v1 import lane_map_pb2
-
-MAX_UNREAD = 4096
-"""Events kept for a slow reader of an iterator; the newest stay."""
 
 T = TypeVar("T")
 
@@ -48,87 +44,6 @@ class Reconnect:
         if retry_after_s is not None and retry_after_s > jittered:
             return retry_after_s + longest * random.uniform(0.0, 0.5)
         return jittered
-
-
-@dataclass(frozen=True)
-class VehiclePose:
-    """Where the vehicle is in its map."""
-
-    sequence: int
-    map_from_vehicle: Pose
-    covariance: Array
-    """6x6, vehicle axes: x, y, z, roll, pitch, yaw."""
-
-
-@dataclass(frozen=True)
-class LocalMap:
-    """The map around the vehicle at one frame, and what that frame changed."""
-
-    sequence: int
-    lanes: tuple[lane_map_pb2.LocalLane, ...]
-    born: tuple[int, ...]
-    grown: tuple[int, ...]
-    dropped: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A frame that was not taken: `field` is `value`, and `limit` says what it may be."""
-
-    sequence: int | None
-    field: str
-    value: str
-    limit: str
-    message: str
-
-
-@dataclass
-class Summary:
-    """What became of a drive."""
-
-    acked: int | None = None
-    """Last durable frame, inclusive."""
-    refused: int = 0
-    """Frames refused, of those sent in this session."""
-    reconnections: int = 0
-    """Connections that broke."""
-
-
-class Feed(Generic[T]):
-    """An iterator over what a session hears, from when it was asked for to the session's end. Where it is not read in
-    time the oldest are dropped, and counted in `missed`."""
-
-    def __init__(self) -> None:
-        self._unread: deque[T] = deque()
-        self._changed = threading.Condition()
-        self._end: Exception | None = None
-        self._over = False
-        self.missed = 0
-
-    def __iter__(self) -> Iterator[T]:
-        return self
-
-    def __next__(self) -> T:
-        with self._changed:
-            self._changed.wait_for(lambda: self._unread or self._over)
-            if self._unread:
-                return self._unread.popleft()
-            if self._end is not None:
-                raise self._end
-            raise StopIteration
-
-    def _put(self, event: T) -> None:
-        with self._changed:
-            if len(self._unread) == MAX_UNREAD:
-                self._unread.popleft()
-                self.missed += 1
-            self._unread.append(event)
-            self._changed.notify()
-
-    def _close(self, error: Exception | None) -> None:
-        with self._changed:
-            self._over, self._end = True, error
-            self._changed.notify_all()
 
 
 class Session:
@@ -179,7 +94,8 @@ class Session:
         self._over = False
         self._error: Exception | None = None
         self._gone = threading.Event()
-        self._stream: object | None = None
+        self._stream: Stream | None = None
+        self._sending_failed: SpoolError | None = None
         self._feeds: dict[type, list[Feed[object]]] = {}
         self._thread = threading.Thread(target=self._run, name=f"lanemap {drive}", daemon=True)
         self._thread.start()
@@ -242,7 +158,7 @@ class Session:
             stream = self._stream
         self._gone.set()
         if stream is not None:
-            stream.cancel()  # type: ignore[attr-defined]
+            stream.cancel()
         self._backlog.close(delivered=False)
         self._thread.join()
 
@@ -346,7 +262,7 @@ class Session:
         with self._changed:
             self._feeds.setdefault(kind, []).append(feed)  # type: ignore[arg-type]
             if self._over:
-                feed._close(self._error)
+                feed.close(self._error)
         return feed
 
     def _raise_if_failed(self) -> None:
@@ -374,7 +290,7 @@ class Session:
             self._changed.notify_all()
             for feeds in self._feeds.values():
                 for feed in feeds:
-                    feed._close(error)
+                    feed.close(error)
 
     def _stream_until_done(self) -> bool:
         """Whether the drive has ended, and the service has all of it."""
@@ -416,6 +332,8 @@ class Session:
                 return True
             while (answer := stream.answer()) is not None:
                 self._hear(answer)
+            if self._sending_failed is not None:
+                raise self._sending_failed
             if self._backlog.leaving is not None and not len(self._backlog):
                 return self._backlog.leaving is Leaving.END
             raise StreamBroken("the stream ended", transient=True)
@@ -427,7 +345,11 @@ class Session:
     def _requests(self, stream: int) -> Iterator[bytes]:
         yield ingest.StreamObservationsRequest(start=self._start).SerializeToString()
         while True:
-            following = self._backlog.next(stream)
+            try:
+                following = self._backlog.next(stream)
+            except SpoolError as error:
+                self._sending_failed = error  # The stream ends here; its other side says so.
+                return
             if isinstance(following, bytes):
                 yield frame_request(following)
                 continue
@@ -493,7 +415,7 @@ class Session:
         with self._changed:
             feeds = self._feeds.get(type(event), ())
         for feed in feeds:
-            feed._put(event)
+            feed.put(event)
 
 
 def frame_request(frame: bytes) -> bytes:

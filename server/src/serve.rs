@@ -36,7 +36,10 @@ use axum::{
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
-use tower_http::{compression::CompressionLayer, cors::CorsLayer};
+use tower_http::{
+    compression::CompressionLayer,
+    cors::{AllowHeaders, CorsLayer},
+};
 
 use self::{
     extents::Extents,
@@ -99,7 +102,8 @@ pub fn router(state: ServeState) -> Router {
         .method_not_allowed_fallback(method_not_allowed)
         .layer(CompressionLayer::new())
         .layer(middleware::from_fn(entity_tag::tell_compressed_apart))
-        .layer(CorsLayer::permissive().expose_headers([header::ETAG]))
+        // A `*` for headers would leave out `authorization`: browsers want it by name.
+        .layer(CorsLayer::permissive().allow_headers(AllowHeaders::mirror_request()).expose_headers([header::ETAG]))
         .with_state(Shared { state, extents: Extents::default() })
 }
 

@@ -2,7 +2,7 @@
 
 use lanemap_proto::v1::{self, map_service_client::MapServiceClient};
 use lanemap_server::ServerConfig;
-use reqwest::{StatusCode, header};
+use reqwest::{Method, StatusCode, header};
 use serde_json::{Value, json};
 use tonic::Code;
 
@@ -46,6 +46,22 @@ async fn maps_and_metrics_are_for_readers_and_health_is_for_all() {
     assert_code(maps.list_sessions(with_token(list(), None)).await, Code::Unauthenticated);
     assert_code(maps.list_sessions(with_token(list(), Some(&vehicle))).await, Code::PermissionDenied);
     maps.list_sessions(with_token(list(), Some(&reader))).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_page_of_another_origin_may_ask_with_a_token() {
+    let service = Secured::start(|config| config).await;
+    let url = format!("https://localhost:{}/sessions", service.server.address().port());
+    let preflight = service.http(None).request(Method::OPTIONS, &url);
+    let preflight = preflight.header(header::ORIGIN, "https://maps.test");
+    let preflight = preflight.header(header::ACCESS_CONTROL_REQUEST_METHOD, "GET");
+    let preflight = preflight.header(header::ACCESS_CONTROL_REQUEST_HEADERS, "authorization");
+    let allowed = preflight.send().await.unwrap();
+    assert_eq!(allowed.status(), StatusCode::OK);
+    assert_eq!(allowed.headers()[header::ACCESS_CONTROL_ALLOW_HEADERS], "authorization");
+    let refused = service.http(None).get(&url).header(header::ORIGIN, "https://maps.test").send().await.unwrap();
+    assert_eq!(refused.status(), StatusCode::UNAUTHORIZED);
+    assert_eq!(refused.headers()[header::ACCESS_CONTROL_ALLOW_ORIGIN], "*", "the page must see why");
 }
 
 #[tokio::test(flavor = "multi_thread")]

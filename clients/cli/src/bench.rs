@@ -11,6 +11,7 @@ mod server_process;
 mod tally;
 mod tape;
 mod vehicle;
+mod zenoh;
 
 use std::process::ExitCode;
 

@@ -20,6 +20,8 @@ pub enum Answer {
     Refused { sequence: Option<Sequence>, message: String },
     /// The drive is over and durable.
     Ended,
+    /// The stream is closed (zenoh); with what is wrong, where something is.
+    Closed { trouble: Option<String> },
     /// Nothing that is measured.
     Other,
 }
@@ -38,6 +40,9 @@ impl Answer {
             Some(Message::Ack(ack)) => Self::Acked(Sequence(ack.acked_sequence_inclusive)),
             Some(Message::Refusal(refusal)) => {
                 Self::Refused { sequence: refusal.sequence.map(Sequence), message: refusal.message }
+            }
+            Some(Message::Closed(closed)) => {
+                Self::Closed { trouble: (closed.code != 0).then(|| format!("{}: {}", closed.code, closed.message)) }
             }
             Some(Message::Ended(_)) => Self::Ended,
             _ => Self::Other,

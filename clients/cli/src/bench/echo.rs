@@ -22,6 +22,7 @@ use super::{
     grpc::{Connections, RawCodec},
     ingest::{self, LoadArgs},
     server_process::ServerProcess,
+    tally::Tally,
     tape::Tape,
     vehicle::Link,
 };
@@ -43,7 +44,7 @@ pub fn run(args: &EchoArgs) -> anyhow::Result<ExitCode> {
     ingest::runtime()?.block_on(async {
         let link = Link::Echo(Connections::open(&server.url, args.load.vehicles, ECHO).await?);
         let memory = || async { server.rss_mb().ok() };
-        ingest::load(&args.load, "echo", link, tapes, memory).await
+        ingest::load(&args.load, "echo", link, tapes, Tally::new()?, memory).await
     })
 }
 

@@ -136,7 +136,7 @@ impl Flow {
             }
             Answer::Acked(sequence) => self.acked_up_to(sequence),
             Answer::Refused { sequence, message } => self.refused(sequence, &message),
-            Answer::Ended | Answer::Other => return,
+            Answer::Ended | Answer::Closed { .. } | Answer::Other => return,
         }
         self.shared.sender.wake();
         self.shared.changed.notify_waiters();
@@ -203,6 +203,11 @@ impl Flow {
     /// Waits until nothing is unacked, or the stream is over.
     pub async fn settled(&self) {
         self.when(|state| (state.unacked.is_empty() || state.closed).then_some(())).await;
+    }
+
+    /// Waits until the stream is over.
+    pub async fn closed(&self) {
+        self.when(|state| state.closed.then_some(())).await;
     }
 
     async fn when<T>(&self, reached: impl Fn(&State) -> Option<T>) -> T {

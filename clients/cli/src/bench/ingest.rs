@@ -14,14 +14,18 @@ use super::{
     grpc::Connections,
     rate::FrameRate,
     report::{LoadPlan, LoadReport},
-    server_process::ServerProcess,
+    server_process::{self, ServerProcess},
     tally::Tally,
     tape::Tape,
     vehicle::{Fleet, Link},
+    zenoh::Sessions,
 };
 
 /// The method of the ingest service that vehicles call.
 const STREAM_OBSERVATIONS: &str = "/lanemap.v1.IngestService/StreamObservations";
+/// Where servers listen unless told otherwise.
+const DEFAULT_URL: &str = "http://127.0.0.1:8080";
+const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
 /// Time between the last opened drive and the first frame.
 const SETTLING: Duration = Duration::from_millis(200);
 
@@ -33,9 +37,9 @@ pub struct IngestArgs {
     /// How frames travel
     #[arg(long, value_enum, default_value_t = Transport::Grpc)]
     transport: Transport,
-    /// The server to stream to
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
-    server: String,
+    /// The server to stream to [default: 127.0.0.1, port 8080 over http, port 7447 over zenoh]
+    #[arg(long, value_name = "URL")]
+    server: Option<String>,
     /// Start a server for the length of the run, its store in a temporary folder; LANEMAP_ variables set it up
     #[arg(long, conflicts_with = "server")]
     spawn: bool,
@@ -73,25 +77,47 @@ pub struct LoadArgs {
 enum Transport {
     /// One bidirectional stream per vehicle
     Grpc,
+    /// One key per vehicle, by a router or a server that is one
+    Zenoh,
 }
 
 /// Runs the load; the exit code is 1 where a frame was lost.
 pub fn run(args: &IngestArgs) -> anyhow::Result<ExitCode> {
     let tapes = Tape::load(args.load.drives.as_deref(), &args.load.only)?;
-    let spawned = if args.spawn { Some(ServerProcess::serve()?) } else { None };
-    let url = spawned.as_ref().map_or(args.server.as_str(), |server| &server.url);
+    match args.transport {
+        Transport::Grpc => over_grpc(args, tapes),
+        Transport::Zenoh => over_zenoh(args, tapes),
+    }
+}
+
+fn over_grpc(args: &IngestArgs, tapes: Vec<Tape>) -> anyhow::Result<ExitCode> {
+    let spawned = if args.spawn { Some(ServerProcess::serve(None)?) } else { None };
+    let url = spawned.as_ref().map_or(args.server.as_deref().unwrap_or(DEFAULT_URL), |server| &server.url);
     runtime()?.block_on(async {
-        let link = match args.transport {
-            Transport::Grpc => Link::Grpc(Connections::open(url, args.load.vehicles, STREAM_OBSERVATIONS).await?),
-        };
+        let link = Link::Grpc(Connections::open(url, args.load.vehicles, STREAM_OBSERVATIONS).await?);
         let memory = || async {
             let of_server = match &spawned {
                 Some(server) => server.rss_mb(),
-                None => super::server_process::rss_mb_by_metrics(url).await,
+                None => server_process::rss_mb_by_metrics(url).await,
             };
             of_server.inspect_err(|error| tracing::warn!("the server's memory is not known: {error:#}")).ok()
         };
-        load(&args.load, "grpc", link, tapes, memory).await
+        load(&args.load, "grpc", link, tapes, Tally::new()?, memory).await
+    })
+}
+
+fn over_zenoh(args: &IngestArgs, tapes: Vec<Tape>) -> anyhow::Result<ExitCode> {
+    let free = server_process::free_zenoh_endpoint()?;
+    let spawned = if args.spawn { Some(ServerProcess::serve(Some(&free))?) } else { None };
+    let given = args.server.as_deref().unwrap_or(DEFAULT_ENDPOINT);
+    let endpoint = if spawned.is_some() { &free } else { given };
+    // Zenoh does not run within a runtime of one thread.
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    runtime.block_on(async {
+        let tally = Tally::new()?;
+        let link = Link::Zenoh(Sessions::open(endpoint, args.load.vehicles, &tally).await?);
+        let memory = || async { spawned.as_ref().and_then(|server| server.rss_mb().ok()) };
+        load(&args.load, "zenoh", link, tapes, tally, memory).await
     })
 }
 
@@ -106,9 +132,9 @@ pub async fn load<M: Future<Output = Option<f64>>>(
     transport: &'static str,
     link: Link,
     tapes: Vec<Tape>,
+    tally: Tally,
     memory: impl FnOnce() -> M,
 ) -> anyhow::Result<ExitCode> {
-    let tally = Tally::new()?;
     let (start, run) = watch::channel(None);
     let fleet = Arc::new(Fleet {
         name: run_name(),

@@ -3,6 +3,7 @@
 use std::{
     fs,
     io::{BufRead, BufReader},
+    net::{Ipv4Addr, TcpListener},
     process::{Child, Command, Stdio},
 };
 
@@ -19,11 +20,15 @@ pub struct ServerProcess {
 }
 
 impl ServerProcess {
-    /// `lanemap serve` on a free port, its store in a temporary folder, everything else as the environment says.
-    pub fn serve() -> anyhow::Result<Self> {
+    /// `lanemap serve` on a free port, its store in a temporary folder, everything else as the environment says. With an
+    /// endpoint of zenoh, it is a router there too.
+    pub fn serve(zenoh: Option<&str>) -> anyhow::Result<Self> {
         let folder = tempfile::tempdir().context("no temporary folder")?;
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["serve", "--listen", "127.0.0.1:0", "--data-dir"]).arg(folder.path());
+        if let Some(endpoint) = zenoh {
+            command.args(["--zenoh-mode", "router", "--zenoh-listen", endpoint]);
+        }
         Self::start(command, folder)
     }
 
@@ -61,6 +66,12 @@ impl Drop for ServerProcess {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// An endpoint of zenoh on this machine at which nobody listens now.
+pub fn free_zenoh_endpoint() -> anyhow::Result<String> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
+    Ok(format!("tcp/{}", listener.local_addr()?))
 }
 
 /// Memory that the process of a server elsewhere holds, MB, as its metrics say.

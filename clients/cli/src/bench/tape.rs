@@ -96,7 +96,7 @@ impl Tape {
         let DriveName { fleet, vehicle, drive } = name;
         request(Request::Start(v1::SessionStart {
             fleet_id: fleet.to_owned(),
-            vehicle_id: format!("vehicle-{vehicle}"),
+            vehicle_id: vehicle_id(vehicle),
             drive_id: format!("drive-{drive}"),
             preset: encode::preset(Preset::Default).into(),
             sensor: Some(v1::Sensor {
@@ -112,6 +112,11 @@ impl Tape {
     pub fn end() -> Bytes {
         request(Request::End(v1::SessionEnd {}))
     }
+}
+
+/// The name of a vehicle.
+pub fn vehicle_id(vehicle: u32) -> String {
+    format!("vehicle-{vehicle}")
 }
 
 fn encoded(frame: &Frame) -> Bytes {

@@ -2,12 +2,13 @@
 
 use std::sync::Arc;
 
+use bytes::Bytes;
 use tokio::{
-    sync::watch,
+    sync::{oneshot, watch},
     task::JoinSet,
     time::{Duration, Instant, sleep, timeout_at},
 };
-use tonic::{Code, Status};
+use tonic::{Code, Status, Streaming};
 
 use super::{
     answer::Answer,
@@ -16,6 +17,7 @@ use super::{
     rate::FrameRate,
     tally::Tally,
     tape::{DriveName, Tape},
+    zenoh::Sessions,
 };
 
 /// Time that acks get after the last frame; what is not acked by then is lost.
@@ -44,6 +46,8 @@ pub struct Fleet {
 pub enum Link {
     /// The ingest service over gRPC.
     Grpc(Connections),
+    /// The ingest service over zenoh.
+    Zenoh(Sessions),
     /// A gRPC service that sends back what it gets.
     Echo(Connections),
 }
@@ -125,40 +129,33 @@ impl Fleet {
     }
 
     async fn open(&self, vehicle: u32, number: u32, mut leg: Leg) -> Result<OpenDrive, Status> {
-        let (connections, is_echo) = match &self.link {
-            Link::Grpc(connections) => (connections, false),
-            Link::Echo(connections) => (connections, true),
-        };
-        if !is_echo {
+        if !matches!(self.link, Link::Echo(_)) {
             let name = DriveName { fleet: &self.name, vehicle, drive: number };
             leg.framing = Some(Framing { start: leg.tape.start(name), end: Tape::end() });
         }
         let (flow, outgoing) = flow(leg, self.window, &self.tally);
-        let mut answers = connections.stream(vehicle, outgoing).await?;
-        let (reader, tally) = (flow.clone(), self.tally.clone());
-        let (refuse, mut refused) = tokio::sync::oneshot::channel();
-        let reading = tokio::spawn(async move {
-            let ended = loop {
-                match answers.message().await {
-                    Ok(Some(_)) if is_echo => reader.take_echo(),
-                    Ok(Some(bytes)) => match Answer::parse(bytes) {
-                        Ok(answer) => reader.take(answer),
-                        Err(error) => break Err(Status::internal(error.to_string())),
-                    },
-                    Ok(None) => break Ok(()),
-                    Err(status) => break Err(status),
-                }
-            };
-            reader.close();
-            if let Err(status) = ended {
-                // Nobody waits for it once the drive is open.
-                if let Err(status) = refuse.send(status) {
-                    let mut counts = tally.counts();
-                    counts.broken += 1;
-                    counts.complain(|| format!("a stream broke: {status}"));
-                }
+        let (refuse, mut refused) = oneshot::channel();
+        let reading = match &self.link {
+            Link::Grpc(connections) => {
+                let answers = connections.stream(vehicle, outgoing).await?;
+                let reader = flow.clone();
+                let take = move |bytes| Answer::parse(bytes).map(|answer| reader.take(answer));
+                tokio::spawn(read(answers, take, flow.clone(), refuse, self.tally.clone()))
             }
-        });
+            Link::Echo(connections) => {
+                let answers = connections.stream(vehicle, outgoing).await?;
+                let reader = flow.clone();
+                let take = move |_| {
+                    reader.take_echo();
+                    Ok(())
+                };
+                tokio::spawn(read(answers, take, flow.clone(), refuse, self.tally.clone()))
+            }
+            Link::Zenoh(sessions) => sessions
+                .stream((&self.name, vehicle), outgoing, flow.clone(), self.tally.clone())
+                .await
+                .map_err(|error| Status::unavailable(error.to_string()))?,
+        };
         if flow.accepted().await {
             refused.close();
             self.tally.counts().drives += 1;
@@ -167,6 +164,34 @@ impl Fleet {
         let _ = reading.await;
         Err(refused.try_recv().unwrap_or_else(|_| Status::unavailable("the stream ended before the drive was open")))
     }
+}
+
+/// Reads the answers of a gRPC stream to its end. A stream that breaks is told to who waits for its opening, or counted.
+async fn read(
+    mut answers: Streaming<Bytes>,
+    take: impl Fn(Bytes) -> Result<(), prost::DecodeError>,
+    flow: Flow,
+    refuse: oneshot::Sender<Status>,
+    tally: Tally,
+) {
+    let ended = loop {
+        match answers.message().await {
+            Ok(Some(bytes)) => {
+                if let Err(error) = take(bytes) {
+                    break Err(Status::internal(error.to_string()));
+                }
+            }
+            Ok(None) => break Ok(()),
+            Err(status) => break Err(status),
+        }
+    };
+    // Told before the flow closes: who waits for the opening asks then.
+    if let Err(Err(status)) = ended.map_err(|status| refuse.send(status)) {
+        let mut counts = tally.counts();
+        counts.broken += 1;
+        counts.complain(|| format!("a stream broke: {status}"));
+    }
+    flow.close();
 }
 
 /// Waits for the acks of a drive that is sent, as long as they may take, then for the end of its stream.

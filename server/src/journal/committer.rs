@@ -75,7 +75,9 @@ impl Committer {
     fn run(mut self) {
         while let Some(first) = self.waiting.blocking_recv() {
             let started = Instant::now();
+            let span = tracing::info_span!("commit", frames = tracing::field::Empty).entered();
             let (frames, done, outcome) = self.commit_waiting(first);
+            span.record("frames", frames);
             metrics::histogram!(telemetry::COMMIT_SECONDS).record(started.elapsed().as_secs_f64());
             metrics::histogram!(telemetry::COMMIT_FRAMES).record(frames as f64);
             if let Err(error) = &outcome {

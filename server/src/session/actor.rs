@@ -15,13 +15,13 @@ use tokio::{
     sync::{mpsc, oneshot},
     time::{Instant, sleep_until},
 };
-use tokio_util::sync::CancellationToken;
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::Status;
 
 use super::{
     SessionRecord, SessionState, Sessions,
     drive::{Admission, Drive, DriveError, Loaded},
-    registry::blocking,
+    registry::{self, blocking},
 };
 use crate::{
     config::ServerConfig,
@@ -34,7 +34,7 @@ use crate::{
 
 /// Steps of a mapper between two chances for other tasks to run: about a millisecond.
 const STEPS_IN_A_ROW: usize = 8;
-/// A publication may take this share of a session's time at most: one part in so many.
+/// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
 
 /// Numbers the streams of one session, so that what a superseded stream still sends is told apart.
@@ -89,6 +89,8 @@ pub(crate) struct Actor {
     record: SessionRecord,
     drive: Drive,
     commands: mpsc::Receiver<Command>,
+    /// The actors that are running, this one among them.
+    actors: TaskTracker,
     stream: Option<Stream>,
     unpublished: bool,
     next_publication: Instant,
@@ -140,6 +142,7 @@ impl Actor {
         surroundings: Surroundings,
         Loaded { record, drive, replayed }: Loaded,
         commands: mpsc::Receiver<Command>,
+        actors: TaskTracker,
     ) -> Self {
         let now = Instant::now();
         let mut actor = Self {
@@ -147,6 +150,7 @@ impl Actor {
             record,
             drive,
             commands,
+            actors,
             stream: None,
             unpublished: false,
             next_publication: now,
@@ -453,7 +457,9 @@ impl Actor {
     }
 
     fn publication_pause(&self, took: Duration) -> Duration {
-        self.surroundings.config.publish_interval().max(took * PUBLISH_SHARE)
+        let sessions_per_core = self.actors.len().div_ceil(registry::cores());
+        let sessions_per_core = u32::try_from(sessions_per_core).unwrap_or(u32::MAX).max(1);
+        self.surroundings.config.publish_interval().max(took.saturating_mul(PUBLISH_SHARE * sessions_per_core))
     }
 }
 

@@ -283,7 +283,7 @@ impl SessionRegistry {
 impl Shared {
     fn begin_actor(&self, loaded: Loaded, outbox: Outbox) -> ActorHandle {
         let (commands, waiting) = mpsc::channel(self.surroundings.config.max_frames_in_flight);
-        let actor = Actor::new(self.surroundings.clone(), loaded, waiting);
+        let actor = Actor::new(self.surroundings.clone(), loaded, waiting, self.actors.clone());
         ActorHandle { commands, outbox, task: self.actors.spawn(actor.run()) }
     }
 
@@ -362,7 +362,7 @@ async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) -> Opt
     }
 }
 
-fn cores() -> usize {
+pub(super) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 

@@ -1,4 +1,4 @@
-//! Counts and times requests by the route that took them: a template, so that no path of a client becomes a label.
+//! Counts, times and traces requests by the route that took them: a template, so that no path of a client becomes a label.
 
 use std::time::Instant;
 
@@ -8,6 +8,8 @@ use axum::{
     middleware::Next,
     response::Response,
 };
+
+use tracing::Instrument;
 
 use super::{REQUEST_SECONDS, REQUESTS};
 
@@ -20,8 +22,10 @@ pub async fn observe(request: Request, next: Next) -> Response {
     let method = method_label(request.method());
     let route =
         request.extensions().get::<MatchedPath>().map_or_else(|| NO_ROUTE.to_owned(), |path| path.as_str().to_owned());
-    let response = next.run(request).await;
+    let span = tracing::info_span!("request", method, route, status = tracing::field::Empty);
+    let response = next.run(request).instrument(span.clone()).await;
     let status = response.status().as_u16().to_string();
+    span.record("status", &status);
     metrics::histogram!(REQUEST_SECONDS, "method" => method, "route" => route.clone())
         .record(started.elapsed().as_secs_f64());
     metrics::counter!(REQUESTS, "method" => method, "route" => route, "status" => status).increment(1);

@@ -125,14 +125,11 @@ def container(folder, settings, state, command=None):
         *settings["ENTRYPOINT"], *(command or settings["CMD"]),
     ]
     print("$", shlex.join(map(str, command)), flush=True)
-    process = subprocess.Popen(list(map(str, command)))
+    # A user namespace of the container's own user, as an engine without root makes it.
+    process = subprocess.Popen(list(map(str, command)), user=int(user), group=int(group), extra_groups=[])
     try:
         yield process
-        # bwrap's child is the server: it gets the signal that the container file names.
-        child = int(subprocess.check_output(["pgrep", "-P", str(process.pid)]).split()[0])
-        children = subprocess.run(["pgrep", "-P", str(child)], stdout=subprocess.PIPE).stdout.split()
-        os.kill(int(children[0]) if children else child, signal.Signals[settings["STOPSIGNAL"]])
-        must(process.wait(STOPPED_WITHIN_S) == 0, f"the server stopped with status {process.returncode}")
+        stop(process, settings)
     finally:
         process.kill()
         process.wait()
@@ -168,10 +165,19 @@ def certificates(folder):
         file.chmod(0o644)
 
 
+def stop(process, settings):
+    """Sends the signal that the container file names to the server, the innermost of bwrap's children."""
+    innermost = process.pid
+    while below := subprocess.run(["pgrep", "-P", str(innermost)], stdout=subprocess.PIPE).stdout.split():
+        innermost = int(below[0])
+    os.kill(innermost, signal.Signals[settings["STOPSIGNAL"]])
+    must(process.wait(STOPPED_WITHIN_S) == 0, f"the server stopped with status {process.returncode}")
+
+
 @contextlib.contextmanager
-def laid_out(lanemap, target):
+def laid_out(lanemap):
     """The image's files and an empty volume."""
-    with tempfile.TemporaryDirectory(dir=target) as folder, tempfile.TemporaryDirectory(dir=target) as state:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as state:
         folder, state = pathlib.Path(folder), pathlib.Path(state)
         os.chmod(folder, 0o755)
         settings = image(lanemap, folder)
@@ -180,9 +186,9 @@ def laid_out(lanemap, target):
         yield folder, state, settings
 
 
-def shipped_configuration(lanemap, target):
+def shipped_configuration(lanemap):
     """The container's own command on the shipped configuration: it serves through TLS, and maps to nobody unknown."""
-    with laid_out(lanemap, target) as (folder, state, settings):
+    with laid_out(lanemap) as (folder, state, settings):
         tls_folder = folder / "etc/lanemap/tls"
         certificates(tls_folder)
         tls = ssl.create_default_context(cafile=tls_folder / "server.crt")
@@ -194,10 +200,10 @@ def shipped_configuration(lanemap, target):
             must(any(state.iterdir()), "the volume stayed empty")
 
 
-def composed(lanemap, target):
+def composed(lanemap):
     """The server as compose.yaml starts it: it takes drives, counts them, stops cleanly."""
     command = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["lanemap"]["command"]
-    with laid_out(lanemap, target) as (folder, state, settings):
+    with laid_out(lanemap) as (folder, state, settings):
         with container(folder, settings, state, command) as process:
             url = f"http://127.0.0.1:{settings['EXPOSE']}"
             wait_ready(url, process)
@@ -216,8 +222,8 @@ def main():
     compose(target / "node/node_modules")
     grafana()
     unit(lanemap, target)
-    shipped_configuration(lanemap, target)
-    composed(lanemap, target)
+    shipped_configuration(lanemap)
+    composed(lanemap)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ use lanemap_proto::{
 };
 use lanemap_server::{
     Server, ServerConfig,
+    config::ZenohMode,
     privacy::{
         TripCut,
         trip_cut::{Passage, TripEnds},
@@ -443,6 +444,21 @@ async fn a_cut_drive_that_kills_interrupt_anywhere_gives_the_same_map_and_its_en
     for frame in [&drive.frames[2], &drive.frames[158]] {
         wait_until("an end to be erased", || !on_disk(folder.path(), &trace_of_frame(frame)));
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cut_drive_gives_the_same_map_over_zenoh() {
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = raw_zenoh::free_endpoint();
+    let zenoh_listen = endpoint.parse().unwrap();
+    let config = ServerConfig { zenoh_mode: ZenohMode::Router, zenoh_listen, ..cutting(folder.path()) };
+    let server = Server::start(config).await.unwrap();
+    let drive = with_fixes(&drives::simulated(5, 160));
+    let vehicle = raw_zenoh::connect(&endpoint).await;
+    let (mut stream, accepted) = RawZenohStream::started(&vehicle, drive.wire_start()).await;
+    stream.stream(&drive.frames, 16).await;
+    stream.end_drive().await;
+    assert_same_map(&map_bytes(&server.url(), &accepted.session_id).await, &middle(&drive));
 }
 
 #[tokio::test(flavor = "multi_thread")]

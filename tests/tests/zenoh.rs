@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
 
 use std::{
+    fs::{self, File},
     io::{BufRead, BufReader},
     path::Path,
     process::{Child, Command, Stdio},
@@ -43,7 +44,7 @@ fn start_of(drive: &Drive, vehicle: &str) -> v1::SessionStart {
     v1::SessionStart { vehicle_id: vehicle.to_owned(), ..drive.wire_start() }
 }
 
-/// `lanemap serve` in a process of its own, to be killed.
+/// `lanemap serve` in a process of its own, to be killed; its log lies beside its store.
 struct Process {
     child: Child,
     url: String,
@@ -53,7 +54,9 @@ impl Process {
     fn start(folder: &Path, endpoint: &str) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"));
         command.args(["serve", "--listen", "127.0.0.1:0", "--zenoh-mode", "router", "--zenoh-listen", endpoint]);
-        let mut child = command.arg("--data-dir").arg(folder).stdout(Stdio::piped()).spawn().unwrap();
+        let log = File::create(folder.join("log")).unwrap();
+        let command = command.arg("--data-dir").arg(folder.join("store")).env_remove("RUST_LOG");
+        let mut child = command.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
         let mut line = String::new();
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let url = line.split([' ', ',']).find(|word| word.starts_with("http://")).unwrap_or_else(|| panic!("{line:?}"));
@@ -465,4 +468,39 @@ async fn a_vehicle_that_never_reads_slows_no_neighbour_and_loses_its_stream() {
         assert_same_map(&map_bytes(&server.url(), &accepted.session_id).await, &drive);
     };
     tokio::join!(cut, neighbour);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_log_and_no_metric_names_a_vehicle_that_streams_over_zenoh() {
+    const VEHICLE: &str = "nobody-may-read-this";
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = free_endpoint();
+    let server = Process::start(folder.path(), &endpoint);
+    let session = raw_zenoh::connect(&endpoint).await;
+    let drive = drives::simulated(7, 10);
+    let (mut stream, _) = RawZenohStream::started(&session, start_of(&drive, VEHICLE)).await;
+    stream.stream(&drive.frames, IN_FLIGHT).await;
+    stream.next_number += 1;
+    stream.send_frame(encode::frame(&drive.frames[0])).await;
+    assert_eq!(Code::from(stream.closed().await.code), Code::DataLoss);
+    stream.put(Vec::new(), None).await;
+    assert!(matches!(stream.any_answer().await, (_, Response::Closed(_))));
+    // A link that breaks in mid-stream.
+    let other = raw_zenoh::connect(&endpoint).await;
+    let (_lost, _) = RawZenohStream::started(&other, start_of(&drive, VEHICLE)).await;
+    other.close().await.unwrap();
+
+    let metrics = reqwest::get(format!("{}/metrics", server.url)).await.unwrap().text().await.unwrap();
+    for counted in [
+        "lanemap_zenoh_streams_broken_total{code=\"DataLoss\"} 1",
+        "lanemap_zenoh_messages_turned_away_total 1",
+        "lanemap_zenoh_messages_repeated_total 0",
+    ] {
+        assert!(metrics.contains(counted), "{counted} is missing from {metrics}");
+    }
+    assert!(!metrics.contains(VEHICLE));
+    server.kill();
+    let log = fs::read_to_string(folder.path().join("log")).unwrap();
+    assert!(log.contains("taking observations over zenoh"), "{log}");
+    assert!(!log.contains(VEHICLE), "{log}");
 }

@@ -490,7 +490,7 @@ async fn no_log_and_no_metric_names_a_vehicle_that_streams_over_zenoh() {
     let (_lost, _) = RawZenohStream::started(&other, start_of(&drive, VEHICLE)).await;
     other.close().await.unwrap();
 
-    let metrics = reqwest::get(format!("{}/metrics", server.url)).await.unwrap().text().await.unwrap();
+    let metrics = lanemap_tests::http::get(format!("{}/metrics", server.url)).await.unwrap().text().await.unwrap();
     for counted in [
         "lanemap_zenoh_streams_broken_total{code=\"DataLoss\"} 1",
         "lanemap_zenoh_messages_turned_away_total 1",
@@ -503,4 +503,64 @@ async fn no_log_and_no_metric_names_a_vehicle_that_streams_over_zenoh() {
     let log = fs::read_to_string(folder.path().join("log")).unwrap();
     assert!(log.contains("taking observations over zenoh"), "{log}");
     assert!(!log.contains(VEHICLE), "{log}");
+
+async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = free_endpoint();
+    let start_router = || zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[]));
+    let router = start_router().await.unwrap();
+    let settings = ServerConfig {
+        zenoh_mode: ZenohMode::Client,
+        zenoh_connect: endpoint.parse().unwrap(),
+        ..servers::config(folder.path())
+    };
+    let server = Server::start(settings).await.unwrap();
+    let session = raw_zenoh::connect(&endpoint).await;
+    raw_zenoh::server_is_there(&session, true).await;
+    let drive = drives::simulated(5, 60);
+    let (mut stream, _) = RawZenohStream::started(&session, drive.wire_start()).await;
+    stream.stream(&drive.frames[..30], IN_FLIGHT).await;
+    router.close().await.unwrap();
+    session.close().await.unwrap();
+
+    let router = start_router().await.unwrap();
+    let session = raw_zenoh::connect(&endpoint).await;
+    raw_zenoh::server_is_there(&session, true).await;
+    let (mut stream, resumed) = RawZenohStream::started(&session, drive.wire_start()).await;
+    assert_eq!(resumed.resume_after_sequence, Some(30));
+    stream.stream(&drive.frames[30..], IN_FLIGHT).await;
+    stream.end_drive().await;
+    assert_same_map(&map_bytes(&server.url(), &resumed.session_id).await, &drive);
+    server.shutdown().await;
+    router.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_waits_for_its_router_a_while_and_then_says_which_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = free_endpoint();
+    let settings = ServerConfig {
+        zenoh_mode: ZenohMode::Client,
+        zenoh_connect: endpoint.parse().unwrap(),
+        ..servers::config(folder.path())
+    };
+    let (server, router) = tokio::join!(
+        Server::start(settings.clone()),
+        zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[]))
+    );
+    server.unwrap().shutdown().await;
+    router.unwrap().close().await.unwrap();
+    let error = Server::start(settings).await.unwrap_err().to_string();
+    assert!(error.contains(&endpoint), "{error}");
+    // The store is free again.
+    servers::start(folder.path()).await.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_endpoint_that_is_taken_is_named() {
+    let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let endpoint = free_endpoint();
+    let _server = Server::start(config(folder.path(), &endpoint)).await.unwrap();
+    let error = Server::start(config(other.path(), &endpoint)).await.unwrap_err().to_string();
+    assert!(error.contains(&endpoint), "{error}");
 }

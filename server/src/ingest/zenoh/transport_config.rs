@@ -12,6 +12,8 @@ const MESSAGE_OVERHEAD_BYTES: usize = 64 * 1024;
 const BATCH_BYTES: usize = 16 * 1024;
 /// How long a publication waits for a vehicle that does not read before its connection is cut, microseconds.
 const WAIT_BEFORE_CLOSE_US: u64 = 1_000_000;
+/// How long a server that starts as a client waits for its router, milliseconds. Later it waits for ever.
+const WAIT_FOR_ROUTER_MS: u64 = 10_000;
 
 /// Zenoh's configuration.
 ///
@@ -44,6 +46,8 @@ pub(super) fn transport_config(settings: &ServerConfig) -> Result<Config, ZenohE
         // the router that all share, and keeps zenoh's patience.
         let wait = "transport/link/tx/queue/congestion_control/block/wait_before_close";
         set(wait, WAIT_BEFORE_CLOSE_US.to_string())?;
+    } else {
+        set("connect/timeout_ms", WAIT_FOR_ROUTER_MS.to_string())?;
     }
     Ok(config)
 }

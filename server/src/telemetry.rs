@@ -95,6 +95,9 @@ fn begin_at_zero() {
     for name in [FRAMES_ACKED, FRAMES_REPEATED, UPDATES_DROPPED, HANDSHAKES_FAILED, CREDENTIALS_REFUSED] {
         metrics::counter!(name).increment(0);
     }
+    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY] {
+        metrics::counter!(name).increment(0);
+    }
     for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
         metrics::counter!(REFUSALS, "reason" => reason.as_str_name()).increment(0);
     }

@@ -503,7 +503,9 @@ async fn no_log_and_no_metric_names_a_vehicle_that_streams_over_zenoh() {
     let log = fs::read_to_string(folder.path().join("log")).unwrap();
     assert!(log.contains("taking observations over zenoh"), "{log}");
     assert!(!log.contains(VEHICLE), "{log}");
+}
 
+#[tokio::test(flavor = "multi_thread")]
 async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
     let folder = tempfile::tempdir().unwrap();
     let endpoint = free_endpoint();
@@ -552,8 +554,6 @@ async fn a_server_waits_for_its_router_a_while_and_then_says_which_it_was() {
     router.unwrap().close().await.unwrap();
     let error = Server::start(settings).await.unwrap_err().to_string();
     assert!(error.contains(&endpoint), "{error}");
-    // The store is free again.
-    servers::start(folder.path()).await.shutdown().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -7,6 +7,7 @@ pub(crate) mod actor;
 pub(crate) mod drive;
 pub mod forget;
 pub mod id;
+mod mapping_turns;
 pub mod published;
 mod recent;
 pub(crate) mod registry;

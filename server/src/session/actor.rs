@@ -21,6 +21,7 @@ use tonic::Status;
 use super::{
     SessionRecord, SessionState, Sessions,
     drive::{Admission, Drive, DriveError, Loaded},
+    mapping_turns::MappingTurns,
     registry::{self, blocking},
 };
 use crate::{
@@ -91,6 +92,7 @@ pub(crate) struct Actor {
     commands: mpsc::Receiver<Command>,
     /// The actors that are running, this one among them.
     actors: TaskTracker,
+    mapping_turns: MappingTurns,
     stream: Option<Stream>,
     unpublished: bool,
     next_publication: Instant,
@@ -143,6 +145,7 @@ impl Actor {
         Loaded { record, drive, replayed }: Loaded,
         commands: mpsc::Receiver<Command>,
         actors: TaskTracker,
+        mapping_turns: MappingTurns,
     ) -> Self {
         let now = Instant::now();
         let mut actor = Self {
@@ -151,6 +154,7 @@ impl Actor {
             drive,
             commands,
             actors,
+            mapping_turns,
             stream: None,
             unpublished: false,
             next_publication: now,
@@ -373,12 +377,17 @@ impl Actor {
     }
 
     async fn map_all(&mut self, frames: impl Iterator<Item = &Frame>) {
+        let turns = self.mapping_turns.clone();
+        let mut turn = turns.take().await;
         for (index, frame) in frames.enumerate() {
             self.map(frame);
             if (index + 1) % STEPS_IN_A_ROW == 0 {
+                drop(turn);
                 tokio::task::yield_now().await;
+                turn = turns.take().await;
             }
         }
+        drop(turn);
     }
 
     fn ack(&self) {

@@ -26,6 +26,7 @@ use super::{
     actor::{Actor, Attach, Attached, Command, StreamNumber, Surroundings},
     drive::Loaded,
     forget::Forgotten,
+    mapping_turns::MappingTurns,
 };
 use crate::{
     error::Error,
@@ -78,6 +79,7 @@ pub(super) struct Shared {
     live: Arc<Semaphore>,
     streams: AtomicU64,
     actors: TaskTracker,
+    mapping_turns: MappingTurns,
 }
 
 /// Where a drive is kept.
@@ -135,6 +137,7 @@ impl SessionRegistry {
             last_id: Mutex::new(last_id),
             streams: AtomicU64::new(0),
             actors: TaskTracker::new(),
+            mapping_turns: MappingTurns::new(),
         };
         for loaded in holding {
             shared.resume(loaded);
@@ -283,7 +286,8 @@ impl SessionRegistry {
 impl Shared {
     fn begin_actor(&self, loaded: Loaded, outbox: Outbox) -> ActorHandle {
         let (commands, waiting) = mpsc::channel(self.surroundings.config.max_frames_in_flight);
-        let actor = Actor::new(self.surroundings.clone(), loaded, waiting, self.actors.clone());
+        let actor =
+            Actor::new(self.surroundings.clone(), loaded, waiting, self.actors.clone(), self.mapping_turns.clone());
         ActorHandle { commands, outbox, task: self.actors.spawn(actor.run()) }
     }
 

@@ -14,7 +14,7 @@ use lanemap_core::{
 use lanemap_proto::{encode, v1};
 use lanemap_server::{
     ingest::decode::{self, PointFrame},
-    journal::{Journal, JournalFrame, frame_bytes},
+    journal::{Journal, JournalFrame, JournalOptions, frame_bytes},
     session::SessionId,
 };
 use nalgebra::Point3;
@@ -56,7 +56,7 @@ fn decoding(criterion: &mut Criterion) {
 fn journal(criterion: &mut Criterion) {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("a runtime");
     let folder = tempfile::tempdir().expect("a folder");
-    let (journal, _thread) = Journal::open(folder.path(), 2048).expect("an empty store opens");
+    let (journal, _thread) = Journal::open(&JournalOptions::new(folder.path())).expect("an empty store opens");
     let mut group = criterion.benchmark_group("journal_durable");
     group.sample_size(20);
     let mut sequence = 0;

@@ -89,18 +89,34 @@ pub struct ServerConfig {
     pub max_live_sessions: usize,
     /// Most connections at a time; more wait to be accepted.
     pub max_connections: usize,
+    /// Most streams and requests at a time on one connection; a client waits with more.
+    pub max_streams_per_connection: usize,
     /// Frames of one session between the network and the journal, 1 to 4096; a faster vehicle waits.
     pub max_frames_in_flight: usize,
+    /// Bytes of frames of all sessions between the network and the journal, 1 MiB to 1 TiB; vehicles wait where there are more.
+    pub max_bytes_in_flight: usize,
+    /// Frames of a session that wait for one before them, 0 to 4096; more give it up as missing.
+    pub reorder_window_frames: usize,
+    /// Longest that a frame waits for one before it, milliseconds.
+    pub reorder_wait_ms: u64,
     /// Most frames of all sessions made durable together, at least 1.
     pub max_frames_per_commit: usize,
+    /// Writes that may wait for the disk, at least 1; while as many wait, no stream is opened.
+    pub max_waiting_commits: usize,
+    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go on.
+    pub min_free_disk_bytes: u64,
     /// Frames of a session after which its mapper's state is saved and its journal trimmed, at least 1.
     pub snapshot_every_frames: u64,
     /// Least time between two publications of one session's map, milliseconds.
     pub publish_interval_ms: u64,
     /// Time after which a session without a stream leaves memory (its map stays readable), seconds.
     pub unload_after_s: u64,
+    /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for.
+    pub max_cached_map_bytes: usize,
     /// Time between pings that find dead connections, seconds, at least 1.
     pub keep_alive_s: u64,
+    /// Longest that a stream may be open before it names its drive, seconds.
+    pub start_wait_s: u64,
     /// Time between the fall of `/readyz` and the end of streams when the service is told to stop, milliseconds: balancers
     /// see the one before the other.
     pub drain_delay_ms: u64,
@@ -157,12 +173,20 @@ impl Default for ServerConfig {
             max_sessions: 100_000,
             max_live_sessions: 4096,
             max_connections: 8192,
+            max_streams_per_connection: 1024,
             max_frames_in_flight: 64,
+            max_bytes_in_flight: 256 * 1024 * 1024,
+            reorder_window_frames: 32,
+            reorder_wait_ms: 200,
             max_frames_per_commit: 2048,
+            max_waiting_commits: 4096,
+            min_free_disk_bytes: 512 * 1024 * 1024,
             snapshot_every_frames: 1000,
             publish_interval_ms: 150,
             unload_after_s: 60,
+            max_cached_map_bytes: 128 * 1024 * 1024,
             keep_alive_s: 20,
+            start_wait_s: 10,
             drain_delay_ms: 0,
             shutdown_grace_s: 6,
             privacy_key_file: PathBuf::from("privacy.key"),
@@ -256,12 +280,20 @@ impl ServerConfig {
         within("max_sessions", self.max_sessions as f64, 1.0, 1e8, "1 ..= 1e8")?;
         within("max_live_sessions", self.max_live_sessions as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_connections", self.max_connections as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_streams_per_connection", self.max_streams_per_connection as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_frames_in_flight", self.max_frames_in_flight as f64, 1.0, 4096.0, "1 ..= 4096")?;
+        within("max_bytes_in_flight", self.max_bytes_in_flight as f64, 1_048_576.0, 1e12, "1048576 ..= 1e12")?;
+        within("reorder_window_frames", self.reorder_window_frames as f64, 0.0, 4096.0, "0 ..= 4096")?;
+        within("reorder_wait_ms", self.reorder_wait_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("max_frames_per_commit", self.max_frames_per_commit as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("max_waiting_commits", self.max_waiting_commits as f64, 1.0, 1e6, "1 ..= 1e6")?;
+        within("min_free_disk_bytes", self.min_free_disk_bytes as f64, 0.0, 1e18, "0 ..= 1e18")?;
         within("snapshot_every_frames", self.snapshot_every_frames as f64, 1.0, 1e9, "1 ..= 1e9")?;
         within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
+        within("max_cached_map_bytes", self.max_cached_map_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("start_wait_s", self.start_wait_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;
         within("trip_cut_m", self.trip_cut_m, 0.0, 1e5, "0 ..= 1e5")?;
         within("trip_cut_s", self.trip_cut_s, 0.0, 86_400.0, "0 ..= 86400")?;
@@ -317,6 +349,14 @@ impl ServerConfig {
 
     pub(crate) fn unload_after(&self) -> Duration {
         Duration::from_secs(self.unload_after_s)
+    }
+
+    pub(crate) fn reorder_wait(&self) -> Duration {
+        Duration::from_millis(self.reorder_wait_ms)
+    }
+
+    pub(crate) fn start_wait(&self) -> Duration {
+        Duration::from_secs(self.start_wait_s)
     }
 
     pub(crate) fn keep_alive(&self) -> Duration {

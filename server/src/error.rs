@@ -3,6 +3,8 @@
 //! A message that is not valid is no error: it is a [`Refusal`], and its stream goes on. The HTTP side's own refusals
 //! are problem documents ([`crate::serve`]).
 
+use std::time::Duration;
+
 use thiserror::Error;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -52,6 +54,24 @@ pub enum Error {
     /// The drive's data were deleted on request.
     #[error("this drive was deleted on request and takes no more frames; begin another drive")]
     Forgotten,
+    /// As many streams are open as may be.
+    #[error("{limit} streams are open, the most that are served at a time; try again later")]
+    TooManyStreams {
+        /// The most.
+        limit: usize,
+    },
+    /// A stream did not name its drive in time.
+    #[error("no start came within {waited_s} s")]
+    NoStart {
+        /// How long it was waited for, seconds.
+        waited_s: u64,
+    },
+    /// The service takes no more for now.
+    #[error("the service is overloaded: {what}; try again later")]
+    Overloaded {
+        /// What is full.
+        what: String,
+    },
     /// The session's actor ended while it was being spoken to; a new attempt starts another.
     #[error("the session has ended; try again")]
     SessionGone,
@@ -68,8 +88,24 @@ impl Error {
             Self::NotPermitted(_) => Code::PermissionDenied,
             Self::Forgotten => Code::FailedPrecondition,
             Self::Superseded => Code::Aborted,
+            Self::Journal(JournalError::NoRoom { .. }) | Self::TooManyStreams { .. } | Self::Overloaded { .. } => {
+                Code::ResourceExhausted
+            }
+            Self::NoStart { .. } => Code::DeadlineExceeded,
             Self::ShuttingDown | Self::Journal(_) | Self::SessionGone => Code::Unavailable,
             Self::Unreadable { .. } => Code::DataLoss,
+        }
+    }
+
+    /// How long a client should wait before it tries again; `None` where trying again does not help.
+    #[must_use]
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Journal(JournalError::NoRoom { .. }) => Some(Duration::from_secs(10)),
+            Self::TooManyStreams { .. } => Some(Duration::from_secs(5)),
+            Self::Journal(_) | Self::Overloaded { .. } | Self::ShuttingDown => Some(Duration::from_secs(1)),
+            Self::SessionGone => Some(Duration::from_millis(100)),
+            _ => None,
         }
     }
 
@@ -81,7 +117,7 @@ impl Error {
             Self::NoSuchSession { session } => {
                 Some(ErrorDetails::with_resource_info("session", session, "", "no such session"))
             }
-            _ => None,
+            _ => self.retry_after().map(|pause| ErrorDetails::with_retry_info(Some(pause))),
         }
     }
 }
@@ -99,6 +135,13 @@ impl From<Error> for Status {
 mod tests {
     use super::*;
     use lanemap_proto::v1::RefusalReason;
+
+    #[test]
+    fn a_full_disk_tells_a_client_to_come_back_later() {
+        let status = Status::from(Error::from(JournalError::NoRoom { free_bytes: 1, minimum_bytes: 2 }));
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        assert_eq!(status.get_details_retry_info().unwrap().retry_delay, Some(Duration::from_secs(10)));
+    }
 
     #[test]
     fn a_refusal_tells_a_machine_which_field_it_was() {

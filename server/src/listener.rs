@@ -135,7 +135,7 @@ async fn serve_requests(
 
 fn connection_builder(config: &ServerConfig) -> Builder<TokioExecutor> {
     let mut builder = Builder::new(TokioExecutor::new());
-    let streams = u32::try_from(config.max_live_sessions).unwrap_or(u32::MAX).saturating_add(64);
+    let streams = u32::try_from(config.max_streams_per_connection).unwrap_or(u32::MAX);
     builder.http1().timer(TokioTimer::new()).header_read_timeout(Duration::from_secs(30));
     builder
         .http2()

@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status};
 use crate::{
     auth::peer_of,
     error::Error,
-    session::{PublishedMap, SessionId, SessionState, Sessions},
+    session::{PublishedMap, SessionId, SessionState, SessionSummary, Sessions},
 };
 
 /// Sessions on a page where the request does not say.
@@ -44,7 +44,7 @@ pub fn lane_map(published: &PublishedMap) -> v1::LaneMap {
     }
 }
 
-fn session(published: &PublishedMap) -> v1::Session {
+fn session(published: &SessionSummary) -> v1::Session {
     let state = match published.state {
         SessionState::Live => v1::SessionState::Live,
         SessionState::Idle => v1::SessionState::Idle,
@@ -54,7 +54,7 @@ fn session(published: &PublishedMap) -> v1::Session {
         id: published.session.to_string(),
         state: state.into(),
         map_version: published.version.0,
-        lanes: u32::try_from(published.map.lanes.len()).unwrap_or(u32::MAX),
+        lanes: u32::try_from(published.lanes).unwrap_or(u32::MAX),
         last_sequence_inclusive: published.last_sequence.map(|Sequence(number)| number),
         last_time_unix_ns: published.last_time.0,
         preset: encode::preset(published.preset).into(),
@@ -94,7 +94,10 @@ impl MapService for MapGrpc {
         let name = request.into_inner().session_id;
         let id: SessionId =
             name.parse().map_err(|_| Error::NoSuchSession { session: name.chars().take(64).collect() })?;
-        let published = self.sessions.get(&id).ok_or(Error::NoSuchSession { session: name })?;
+        let sessions = self.sessions.clone();
+        let found = tokio::task::spawn_blocking(move || sessions.get(&id)).await;
+        let found = found.map_err(|error| Status::internal(format!("the map cannot be read: {error}")))?;
+        let published = found.ok_or(Error::NoSuchSession { session: name })?;
         let (session, map) = (session(&published), lane_map(&published));
         Ok(Response::new(v1::GetLaneMapResponse { session: Some(session), map: Some(map) }))
     }

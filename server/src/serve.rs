@@ -21,7 +21,7 @@ mod operation;
 pub mod problem;
 mod query;
 #[cfg(test)]
-mod sample;
+pub(crate) mod sample;
 mod sessions;
 mod viewer;
 
@@ -55,9 +55,18 @@ pub struct ServeState {
     /// Renders `/metrics`.
     pub metrics: PrometheusHandle,
     /// Whether the service takes traffic; falls first when it shuts down.
-    pub ready: watch::Receiver<bool>,
+    pub ready: watch::Receiver<Readiness>,
     /// Cancelled when the service shuts down: answers that stay open (server-sent events) must end.
     pub shutdown: CancellationToken,
+}
+
+/// Whether the service takes traffic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Readiness {
+    /// It does.
+    Ready,
+    /// It does not, and why.
+    NotReady(String),
 }
 
 /// State of the handlers: what they are given, and what they keep.

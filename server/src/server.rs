@@ -15,7 +15,7 @@ use tokio::{
     time::{sleep, timeout},
 };
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
-use tonic::{codec::CompressionEncoding, service::Routes};
+use tonic::{codec::CompressionEncoding, server::NamedService, service::Routes};
 use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
@@ -26,17 +26,20 @@ use crate::{
     },
     config::{ConfigError, ServerConfig, ZenohMode},
     ingest::{IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
-    journal::{CommitterThread, Journal, JournalError},
+    journal::{CommitterThread, Journal, JournalError, JournalHealth, JournalOptions},
     listener,
     map_service::MapGrpc,
     privacy::{KeyError, Pseudonyms},
-    serve::{self, ServeState},
-    session::{Sessions, actor::Surroundings, registry::SessionRegistry},
+    serve::{self, Readiness, ServeState},
+    session::{Sessions, actor::Surroundings, in_flight::InFlightBudget, registry::SessionRegistry},
     telemetry,
 };
 
 /// Time between two clean-ups of the metrics' histograms.
 const METRICS_UPKEEP: Duration = Duration::from_secs(5);
+
+/// Time between two looks at the room on the disk, where nothing else asks for it.
+const PROBE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Time for the journal's last commit, once every session has left.
 const JOURNAL_GRACE: Duration = Duration::from_secs(1);
@@ -103,15 +106,16 @@ impl Server {
         let metrics = telemetry::metrics_handle();
         let config = Arc::new(config);
         let in_store = |source| StartError::Journal { folder: config.data_dir.display().to_string(), source };
-        let (journal, committer) = Journal::open(&config.data_dir, config.max_frames_per_commit).map_err(in_store)?;
+        let (journal, committer) = Journal::open(&journal_options(&config)).map_err(in_store)?;
         let pseudonyms = pseudonyms(&config, &journal)?;
-        let (sessions, stop, shutdown) = (Sessions::default(), CancellationToken::new(), CancellationToken::new());
-        let journal_failed = journal.failed();
+        let (sessions, stop, shutdown) =
+            (Sessions::new(config.max_cached_map_bytes), CancellationToken::new(), CancellationToken::new());
         let surroundings = Surroundings {
             config: Arc::clone(&config),
-            journal,
+            journal: journal.clone(),
             pseudonyms,
             sessions: sessions.clone(),
+            in_flight: InFlightBudget::new(&config),
             shutdown: shutdown.clone(),
         };
         let registry = SessionRegistry::recover(surroundings).await.map_err(in_store)?;
@@ -120,7 +124,7 @@ impl Server {
         let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
 
-        let (ready, is_ready) = watch::channel(true);
+        let (ready, is_ready) = watch::channel(Readiness::Ready);
         let http = ServeState { sessions: sessions.clone(), metrics, ready: is_ready, shutdown: shutdown.clone() };
         let streams = TaskTracker::new();
         let conversations =
@@ -129,6 +133,14 @@ impl Server {
         let (health, router) = router(&config, ingest, admin, http).await?;
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
         tokio::spawn(registry.clone().keep_erasing());
+        tokio::spawn({
+            let registry = registry.clone();
+            async move {
+                if let Err(error) = registry.wake_unsaved().await {
+                    tracing::warn!(%error, "what is told of drives that a crash interrupted is not up to date");
+                }
+            }
+        });
         let zenoh = match config.zenoh_mode {
             ZenohMode::Off => None,
             ZenohMode::Router | ZenohMode::Client => Some(
@@ -147,7 +159,7 @@ impl Server {
             health,
             stop: stop.clone(),
             shutdown,
-            journal_failed,
+            journal,
             committer,
         };
         metrics::gauge!(telemetry::READY).set(1.0);
@@ -217,36 +229,54 @@ struct Running {
     registry: SessionRegistry,
     streams: TaskTracker,
     zenoh: Option<ZenohIngest>,
-    ready: watch::Sender<bool>,
+    ready: watch::Sender<Readiness>,
     health: HealthReporter,
     /// The service is told to stop: readiness falls.
     stop: CancellationToken,
     /// The drain begins: streams and sessions end.
     shutdown: CancellationToken,
-    journal_failed: CancellationToken,
+    journal: Journal,
     committer: CommitterThread,
 }
 
 impl Running {
-    async fn turn_unready(&self) {
-        self.ready.send_replace(false);
-        self.health.set_service_status("", ServingStatus::NotServing).await;
-        self.health.set_not_serving::<IngestServiceServer<IngestGrpc>>().await;
-        metrics::gauge!(telemetry::READY).set(0.0);
+    async fn tell_readiness(&self, readiness: Readiness) {
+        let status = if readiness == Readiness::Ready { ServingStatus::Serving } else { ServingStatus::NotServing };
+        metrics::gauge!(telemetry::READY).set(if readiness == Readiness::Ready { 1.0 } else { 0.0 });
+        self.ready.send_replace(readiness);
+        self.health.set_service_status("", status).await;
+        self.health.set_service_status(IngestServiceServer::<IngestGrpc>::NAME, status).await;
+    }
+
+    /// Readiness follows the journal's health: maps stay readable while no frame can be made durable.
+    async fn watch_journal(&self) {
+        let mut health = self.journal.health();
+        loop {
+            let now = health.borrow_and_update().clone();
+            self.tell_readiness(readiness(&now)).await;
+            let changed = async {
+                loop {
+                    tokio::select! {
+                        changed = health.changed() => return changed.is_ok(),
+                        // A disk that runs full is noticed where nothing is written, too.
+                        () = sleep(PROBE_INTERVAL) => { let _ = self.journal.probe().await; }
+                    }
+                }
+            };
+            if !changed.await {
+                return std::future::pending().await;
+            }
+        }
     }
 
     /// Waits for the word to stop; readiness falls at once, the drain begins once balancers have had time to see it.
     async fn stopped(&self) {
         tokio::select! {
             () = self.stop.cancelled() => {}
-            () = self.journal_failed.cancelled() => {
-                self.turn_unready().await;
-                // Maps stay readable; whoever watches readiness restarts the service, which opens the store anew.
-                self.stop.cancelled().await;
-            }
+            () = self.watch_journal() => {}
         }
         tracing::info!("shutting down");
-        self.turn_unready().await;
+        self.tell_readiness(Readiness::NotReady("shutting down".to_owned())).await;
         self.health.set_not_serving::<MapServiceServer<MapGrpc>>().await;
         sleep(self.config.drain_delay()).await;
         self.shutdown.cancel();
@@ -291,7 +321,9 @@ impl Running {
         }
         upkeep.abort();
         watching.abort();
+        self.registry.let_go_of_store();
         drop(self.registry);
+        drop(self.journal);
         if timeout(JOURNAL_GRACE, self.committer.join()).await.is_err() {
             tracing::warn!("the journal was still in use at the end of the grace time");
         }
@@ -317,6 +349,22 @@ fn warn_of_exposure(config: &ServerConfig) {
     }
 }
 
+fn journal_options(config: &ServerConfig) -> JournalOptions {
+    JournalOptions {
+        folder: config.data_dir.clone(),
+        max_frames_per_commit: config.max_frames_per_commit,
+        max_waiting_commits: config.max_waiting_commits,
+        min_free_disk_bytes: config.min_free_disk_bytes,
+    }
+}
+
+fn readiness(journal: &JournalHealth) -> Readiness {
+    match journal.check() {
+        Ok(()) => Readiness::Ready,
+        Err(error) => Readiness::NotReady(format!("frames cannot be made durable: {error}")),
+    }
+}
+
 /// gRPC beside HTTP on one router. Unknown paths are the HTTP side's to answer.
 async fn router(
     config: &ServerConfig,
@@ -335,8 +383,8 @@ async fn router(
     let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone())).send_compressed(CompressionEncoding::Gzip);
     let ingest = IngestServiceServer::new(ingest)
         .max_decoding_message_size(config.max_message_bytes)
-        .accept_compressed(CompressionEncoding::Gzip)
-        .accept_compressed(CompressionEncoding::Zstd);
+        // Not zstd: a sender chooses how much memory unpacking it takes, up to 128 MiB, whatever the limit of a message.
+        .accept_compressed(CompressionEncoding::Gzip);
     let routes = Routes::from(serve::router(http))
         .add_service(ingest)
         .add_service(AdminServiceServer::new(admin))

@@ -7,11 +7,13 @@ pub(crate) mod actor;
 pub(crate) mod drive;
 pub mod forget;
 pub mod id;
+pub(crate) mod in_flight;
 mod mapping_turns;
 pub mod published;
 mod recent;
 pub(crate) mod registry;
+mod reorder;
 
 pub use crate::journal::{SessionKey, SessionRecord, SessionSetup};
 pub use id::SessionId;
-pub use published::{MapVersion, PublishedMap, SessionState, Sessions};
+pub use published::{MapVersion, PublishedMap, SessionState, SessionSummary, Sessions};

@@ -14,6 +14,8 @@ use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 pub const FRAMES_ACKED: &str = "lanemap_frames_acked_total";
 /// Frames that came again and were acked again.
 pub const FRAMES_REPEATED: &str = "lanemap_frames_repeated_total";
+/// Runs of frames that did not come before those after them were taken.
+pub const GAPS: &str = "lanemap_frame_gaps_total";
 /// Messages refused, by `reason`.
 pub const REFUSALS: &str = "lanemap_refusals_total";
 /// Seconds of one step of a mapper.
@@ -109,6 +111,7 @@ fn begin_at_zero() {
 fn describe() {
     describe_counter!(FRAMES_ACKED, Unit::Count, "Frames that were made durable");
     describe_counter!(FRAMES_REPEATED, Unit::Count, "Frames that came again and were acked again");
+    describe_counter!(GAPS, Unit::Count, "Runs of frames that did not come before those after them were taken");
     describe_counter!(REFUSALS, Unit::Count, "Messages refused, by reason");
     describe_histogram!(STEP_SECONDS, Unit::Seconds, "One step of a mapper");
     describe_histogram!(ACK_SECONDS, Unit::Seconds, "From a frame's decoding to its ack");

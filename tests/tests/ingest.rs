@@ -223,7 +223,9 @@ async fn vehicles_beyond_the_two_hundred_streams_of_http2_share_one_connection()
     let sessions = server.sessions().list();
     assert_eq!(sessions.len(), VEHICLES);
     let expected = drive.mapped().lane_map();
-    assert!(sessions.iter().all(|session| *session.map == expected && session.state == SessionState::Closed));
+    assert!(sessions.iter().all(|told| {
+        *server.sessions().get(&told.session).unwrap().map == expected && told.state == SessionState::Closed
+    }));
 }
 
 #[tokio::test(flavor = "multi_thread")]

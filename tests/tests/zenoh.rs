@@ -414,7 +414,9 @@ async fn streams_over_zenoh_count_among_all_streams() {
     let (_one, _) = RawStream::started(&server.url(), start_of(&drive, "one")).await;
     let mut two = RawZenohStream::open(&session, "test-fleet", "two").await;
     two.send(Request::Start(start_of(&drive, "two"))).await;
-    assert_eq!(two.refusal().await.reason(), v1::RefusalReason::Capacity);
+    let closed = two.closed().await;
+    assert_eq!(Code::from(closed.code), Code::ResourceExhausted);
+    assert!(closed.retry_after_ms.is_some());
     // The place that it takes in zenoh itself is bounded too.
     let mut three = RawZenohStream::open(&session, "test-fleet", "three").await;
     three.send(Request::Start(start_of(&drive, "three"))).await;

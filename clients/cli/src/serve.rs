@@ -128,13 +128,37 @@ pub struct ServeArgs {
     /// Most connections at a time; more wait to be accepted [env: LANEMAP_MAX_CONNECTIONS] [default: 8192]
     #[arg(long, value_name = "N")]
     max_connections: Option<usize>,
+    /// Most streams and requests at a time on one connection; a client waits with more
+    /// [env: LANEMAP_MAX_STREAMS_PER_CONNECTION] [default: 1024]
+    #[arg(long, value_name = "N")]
+    max_streams_per_connection: Option<usize>,
     /// Frames of one session between the network and the journal; a faster vehicle waits
     /// [env: LANEMAP_MAX_FRAMES_IN_FLIGHT] [default: 64]
     #[arg(long, value_name = "N")]
     max_frames_in_flight: Option<usize>,
+    /// Bytes of frames of all sessions between the network and the journal, 1 MiB to 1 TiB; vehicles wait where there are more
+    /// [env: LANEMAP_MAX_BYTES_IN_FLIGHT] [default: 268435456]
+    #[arg(long, value_name = "BYTES")]
+    max_bytes_in_flight: Option<usize>,
+    /// Frames of a session that wait for one before them, 0 to 4096; more give it up as missing
+    /// [env: LANEMAP_REORDER_WINDOW_FRAMES] [default: 32]
+    #[arg(long, value_name = "N")]
+    reorder_window_frames: Option<usize>,
+    /// Longest that a frame waits for one before it, milliseconds
+    /// [env: LANEMAP_REORDER_WAIT_MS] [default: 200]
+    #[arg(long, value_name = "MS")]
+    reorder_wait_ms: Option<u64>,
     /// Most frames of all sessions made durable together [env: LANEMAP_MAX_FRAMES_PER_COMMIT] [default: 2048]
     #[arg(long, value_name = "N")]
     max_frames_per_commit: Option<usize>,
+    /// Writes that may wait for the disk, at least 1; while as many wait, no stream is opened
+    /// [env: LANEMAP_MAX_WAITING_COMMITS] [default: 4096]
+    #[arg(long, value_name = "N")]
+    max_waiting_commits: Option<usize>,
+    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go on
+    /// [env: LANEMAP_MIN_FREE_DISK_BYTES] [default: 536870912]
+    #[arg(long, value_name = "BYTES")]
+    min_free_disk_bytes: Option<u64>,
     /// Frames of a session after which its mapper's state is saved and its journal trimmed
     /// [env: LANEMAP_SNAPSHOT_EVERY_FRAMES] [default: 1000]
     #[arg(long, value_name = "N")]
@@ -147,9 +171,17 @@ pub struct ServeArgs {
     /// [env: LANEMAP_UNLOAD_AFTER_S] [default: 60]
     #[arg(long, value_name = "S")]
     unload_after_s: Option<u64>,
+    /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for
+    /// [env: LANEMAP_MAX_CACHED_MAP_BYTES] [default: 134217728]
+    #[arg(long, value_name = "BYTES")]
+    max_cached_map_bytes: Option<usize>,
     /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]
     #[arg(long, value_name = "S")]
     keep_alive_s: Option<u64>,
+    /// Longest that a stream may be open before it names its drive, seconds
+    /// [env: LANEMAP_START_WAIT_S] [default: 10]
+    #[arg(long, value_name = "S")]
+    start_wait_s: Option<u64>,
     /// Time between the fall of /readyz and the end of streams when the service is told to stop, milliseconds
     /// [env: LANEMAP_DRAIN_DELAY_MS] [default: 0]
     #[arg(long, value_name = "MS")]
@@ -213,12 +245,20 @@ impl ServeArgs {
             max_sessions: self.max_sessions,
             max_live_sessions: self.max_live_sessions,
             max_connections: self.max_connections,
+            max_streams_per_connection: self.max_streams_per_connection,
             max_frames_in_flight: self.max_frames_in_flight,
+            max_bytes_in_flight: self.max_bytes_in_flight,
+            reorder_window_frames: self.reorder_window_frames,
+            reorder_wait_ms: self.reorder_wait_ms,
             max_frames_per_commit: self.max_frames_per_commit,
+            max_waiting_commits: self.max_waiting_commits,
+            min_free_disk_bytes: self.min_free_disk_bytes,
             snapshot_every_frames: self.snapshot_every_frames,
             publish_interval_ms: self.publish_interval_ms,
             unload_after_s: self.unload_after_s,
+            max_cached_map_bytes: self.max_cached_map_bytes,
             keep_alive_s: self.keep_alive_s,
+            start_wait_s: self.start_wait_s,
             drain_delay_ms: self.drain_delay_ms,
             shutdown_grace_s: self.shutdown_grace_s,
             privacy_key_file: self.privacy_key_file.clone(),

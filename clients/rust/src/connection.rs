@@ -224,7 +224,8 @@ impl Task {
             Response::Pose(pose) => self.tell(Event::Pose(Box::new(event::pose(&pose)?))),
             Response::LocalMap(map) => self.tell(Event::LocalMap(event::local_map(&map)?)),
             // How a stream ends, its transport says.
-            Response::Ended(_) | Response::Closed(_) => {}
+            // What is missing was never sent, or was sent too late: there is nothing more to send.
+            Response::Ended(_) | Response::Closed(_) | Response::Gap(_) => {}
             Response::Accepted(_) => {
                 return Err(ClientError::Protocol("a session was accepted twice".to_owned()));
             }

@@ -69,18 +69,34 @@ pub struct ConfigOverrides {
     pub max_live_sessions: Option<usize>,
     /// See [`ServerConfig::max_connections`].
     pub max_connections: Option<usize>,
+    /// See [`ServerConfig::max_streams_per_connection`].
+    pub max_streams_per_connection: Option<usize>,
     /// See [`ServerConfig::max_frames_in_flight`].
     pub max_frames_in_flight: Option<usize>,
+    /// See [`ServerConfig::max_bytes_in_flight`].
+    pub max_bytes_in_flight: Option<usize>,
+    /// See [`ServerConfig::reorder_window_frames`].
+    pub reorder_window_frames: Option<usize>,
+    /// See [`ServerConfig::reorder_wait_ms`].
+    pub reorder_wait_ms: Option<u64>,
     /// See [`ServerConfig::max_frames_per_commit`].
     pub max_frames_per_commit: Option<usize>,
+    /// See [`ServerConfig::max_waiting_commits`].
+    pub max_waiting_commits: Option<usize>,
+    /// See [`ServerConfig::min_free_disk_bytes`].
+    pub min_free_disk_bytes: Option<u64>,
     /// See [`ServerConfig::snapshot_every_frames`].
     pub snapshot_every_frames: Option<u64>,
     /// See [`ServerConfig::publish_interval_ms`].
     pub publish_interval_ms: Option<u64>,
     /// See [`ServerConfig::unload_after_s`].
     pub unload_after_s: Option<u64>,
+    /// See [`ServerConfig::max_cached_map_bytes`].
+    pub max_cached_map_bytes: Option<usize>,
     /// See [`ServerConfig::keep_alive_s`].
     pub keep_alive_s: Option<u64>,
+    /// See [`ServerConfig::start_wait_s`].
+    pub start_wait_s: Option<u64>,
     /// See [`ServerConfig::drain_delay_ms`].
     pub drain_delay_ms: Option<u64>,
     /// See [`ServerConfig::shutdown_grace_s`].
@@ -130,12 +146,20 @@ impl ConfigOverrides {
         set(&mut settings.max_sessions, self.max_sessions);
         set(&mut settings.max_live_sessions, self.max_live_sessions);
         set(&mut settings.max_connections, self.max_connections);
+        set(&mut settings.max_streams_per_connection, self.max_streams_per_connection);
         set(&mut settings.max_frames_in_flight, self.max_frames_in_flight);
+        set(&mut settings.max_bytes_in_flight, self.max_bytes_in_flight);
+        set(&mut settings.reorder_window_frames, self.reorder_window_frames);
+        set(&mut settings.reorder_wait_ms, self.reorder_wait_ms);
         set(&mut settings.max_frames_per_commit, self.max_frames_per_commit);
+        set(&mut settings.max_waiting_commits, self.max_waiting_commits);
+        set(&mut settings.min_free_disk_bytes, self.min_free_disk_bytes);
         set(&mut settings.snapshot_every_frames, self.snapshot_every_frames);
         set(&mut settings.publish_interval_ms, self.publish_interval_ms);
         set(&mut settings.unload_after_s, self.unload_after_s);
+        set(&mut settings.max_cached_map_bytes, self.max_cached_map_bytes);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
+        set(&mut settings.start_wait_s, self.start_wait_s);
         set(&mut settings.drain_delay_ms, self.drain_delay_ms);
         set(&mut settings.shutdown_grace_s, self.shutdown_grace_s);
         set(&mut settings.privacy_key_file, self.privacy_key_file);

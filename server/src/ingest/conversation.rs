@@ -8,7 +8,7 @@ use std::sync::Arc;
 use futures::{Stream, StreamExt};
 use lanemap_core::{FrameLimits, Sequence};
 use lanemap_proto::v1::{self, RefusalReason, stream_observations_request::Message};
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::Status;
 
@@ -22,7 +22,7 @@ use crate::{
     error::Error,
     session::{
         actor::Command,
-        registry::{Attachment, OpenError, SessionRegistry},
+        registry::{Attachment, OpenError, SessionRegistry, StreamPlace},
     },
 };
 
@@ -83,7 +83,13 @@ impl Conversations {
         M: Stream<Item = Result<v1::StreamObservationsRequest, Status>> + Unpin,
     {
         let outbox = incoming.outbox.clone();
-        let ending = match self.open(&peer, &mut incoming).await {
+        let _place = match self.place() {
+            Ok(place) => place,
+            Err(error) => return outbox.finish(Err(error.into())),
+        };
+        let opened = timeout(self.config.start_wait(), self.open(&peer, &mut incoming)).await;
+        let too_late = || Err(Err(Error::NoStart { waited_s: self.config.start_wait_s }.into()));
+        let ending = match opened.unwrap_or_else(|_| too_late()) {
             Ok(session) => {
                 outbox.accept(self.accepted(&session));
                 let ending = self.take_messages(&peer, &mut incoming, &session).await;
@@ -93,6 +99,11 @@ impl Conversations {
             Err(ending) => ending,
         };
         outbox.finish(ending);
+    }
+
+    /// A place among the streams.
+    pub(super) fn place(&self) -> Result<StreamPlace, Error> {
+        self.registry.stream_place()
     }
 
     /// Waits for a start that is in order; the error is what the stream ended with before.
@@ -221,11 +232,12 @@ impl OpenSession {
         match decode::frame(message, &self.point_frame, &self.limits) {
             Ok(frame) => {
                 let arrived = Instant::now();
-                self.attachment.send(|stream| Command::Frame { stream, frame: Box::new(frame), arrived }).await
+                self.attachment.send_frame(frame, arrived).await
             }
             Err(refusal) => {
                 outbox.refuse(&refusal).await;
-                Ok(())
+                let sequence = Sequence(message.sequence);
+                self.attachment.send(|stream| Command::Refused { stream, sequence }).await
             }
         }
     }

@@ -1,10 +1,11 @@
 //! What a stream has yet to send to its vehicle, bounded in every part.
 //!
 //! Acks are merged: the newest says all. Poses and local maps are dropped, oldest first, where the vehicle does not read
-//! them. Refusals are kept; a stream that has too many unread is not read from until the vehicle reads again.
+//! them. Refusals and gaps are kept; a stream that has too many unread is not read from until the vehicle reads again.
 
 use std::{
     collections::VecDeque,
+    ops::RangeInclusive,
     pin::Pin,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     task::{Context, Poll},
@@ -19,8 +20,8 @@ use tonic::Status;
 use super::Refusal;
 use crate::telemetry;
 
-/// Refusals that may wait to be read.
-const MAX_REFUSALS: usize = 64;
+/// Refusals and gaps that may wait to be read.
+const MAX_NOTICES: usize = 64;
 /// Poses and local maps that may wait to be read.
 const MAX_UPDATES: usize = 128;
 
@@ -47,7 +48,7 @@ struct Shared {
 struct Waiting {
     accepted: Option<v1::SessionAccepted>,
     ack: Option<Sequence>,
-    refusals: VecDeque<v1::Refusal>,
+    notices: VecDeque<Message>,
     updates: VecDeque<Message>,
     ended: Option<v1::SessionEnded>,
     finish: Option<Result<(), Status>>,
@@ -86,6 +87,17 @@ impl Outbox {
     /// Something was refused; waits for room. Returns at once where nobody reads any more.
     pub async fn refuse(&self, refusal: &Refusal) {
         metrics::counter!(telemetry::REFUSALS, "reason" => refusal.reason.as_str_name()).increment(1);
+        self.notify(Message::Refusal(refusal.to_wire())).await;
+    }
+
+    /// Frames did not come, inclusive; waits for room as a refusal does.
+    pub async fn gap(&self, missing: &RangeInclusive<u64>) {
+        metrics::counter!(telemetry::GAPS).increment(1);
+        let (first_missing_sequence, last_missing_sequence) = (*missing.start(), *missing.end());
+        self.notify(Message::Gap(v1::Gap { first_missing_sequence, last_missing_sequence })).await;
+    }
+
+    async fn notify(&self, notice: Message) {
         loop {
             let room = self.shared.room.notified();
             {
@@ -93,8 +105,8 @@ impl Outbox {
                 if waiting.closed || waiting.finish.is_some() {
                     return;
                 }
-                if waiting.refusals.len() < MAX_REFUSALS {
-                    waiting.refusals.push_back(refusal.to_wire());
+                if waiting.notices.len() < MAX_NOTICES {
+                    waiting.notices.push_back(notice);
                     break;
                 }
             }
@@ -156,8 +168,8 @@ impl Waiting {
         if let Some(sequence) = self.ack.take() {
             return Some(Message::Ack(v1::Ack { acked_sequence_inclusive: sequence.0 }));
         }
-        if let Some(refusal) = self.refusals.pop_front() {
-            return Some(Message::Refusal(refusal));
+        if let Some(notice) = self.notices.pop_front() {
+            return Some(notice);
         }
         self.updates.pop_front().or_else(|| self.ended.take().map(Message::Ended))
     }
@@ -229,7 +241,7 @@ mod tests {
     #[tokio::test]
     async fn refusals_wait_for_their_reader_and_none_is_lost() {
         let (outbox, mut stream) = Outbox::new();
-        for _ in 0..MAX_REFUSALS {
+        for _ in 0..MAX_NOTICES {
             outbox.refuse(&refusal()).now_or_never().unwrap();
         }
         let bad = refusal();
@@ -238,14 +250,14 @@ mod tests {
         stream.next().await.unwrap().unwrap();
         waiting.await;
         outbox.finish(Ok(()));
-        assert_eq!(stream.count().await, MAX_REFUSALS);
+        assert_eq!(stream.count().await, MAX_NOTICES);
     }
 
     #[tokio::test]
     async fn a_writer_does_not_wait_for_a_reader_that_went_away() {
         let (outbox, stream) = Outbox::new();
         drop(stream);
-        for _ in 0..2 * MAX_REFUSALS {
+        for _ in 0..2 * MAX_NOTICES {
             outbox.refuse(&refusal()).now_or_never().unwrap();
         }
         assert!(outbox.is_closed());

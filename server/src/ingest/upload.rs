@@ -15,6 +15,7 @@ use crate::{auth::Peer, error::Error};
 struct Outcome {
     acked: Option<u64>,
     refusals: Vec<v1::Refusal>,
+    gaps: Vec<v1::Gap>,
 }
 
 impl Conversations {
@@ -26,6 +27,7 @@ impl Conversations {
     ) -> Result<v1::UploadObservationsResponse, Status> {
         let v1::UploadObservationsRequest { start, frames, end } = request;
         let start = start.ok_or_else(|| Error::Refused(Box::new(missing_start())))?;
+        let _place = self.place()?;
         let (outbox, answers) = Outbox::new();
         let session = self.start(peer, &start, &outbox).await?;
         let accepted = self.accepted(&session);
@@ -35,11 +37,12 @@ impl Conversations {
             outbox.finish(ending);
         };
         let ((), outcome) = tokio::join!(hand_over, collect(answers));
-        let Outcome { acked, refusals } = outcome?;
+        let Outcome { acked, refusals, gaps } = outcome?;
         Ok(v1::UploadObservationsResponse {
             acked_sequence_inclusive: acked.or(accepted.resume_after_sequence),
             accepted: Some(accepted),
             refusals,
+            gaps,
         })
     }
 }
@@ -57,6 +60,7 @@ async fn collect(mut answers: OutboxStream) -> Result<Outcome, Status> {
         match answer?.message {
             Some(Answer::Ack(ack)) => outcome.acked = Some(ack.acked_sequence_inclusive),
             Some(Answer::Refusal(refusal)) => outcome.refusals.push(refusal),
+            Some(Answer::Gap(gap)) => outcome.gaps.push(gap),
             _ => {}
         }
     }

@@ -7,15 +7,16 @@ use std::{
     collections::BTreeSet,
     fs, io,
     path::{Path, PathBuf},
-    time::{SystemTime, UNIX_EPOCH},
+    thread,
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
-use fjall::Keyspace;
+use fjall::{Keyspace, PersistMode};
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::{
     Journal, JournalError,
-    committer::Commit,
+    committer::Write,
     decode_error,
     store::{Store, StoreBatch},
 };
@@ -26,6 +27,8 @@ const ERASURE_DUE: &str = "erasure due";
 
 /// Length of one filler; the store begins a new log where one has outgrown 64 MB.
 const FILLER_BYTES: usize = 8 << 20;
+/// Pause between two looks at what the store writes in the background.
+const FLUSH_PAUSE: Duration = Duration::from_millis(2);
 /// Fillers after which a log must have been outgrown, many times over.
 const MOST_FILLERS: u64 = 64;
 
@@ -60,7 +63,7 @@ impl Journal {
         outdated: Vec<DrivePseudonym>,
     ) -> Result<(), JournalError> {
         let forget = Forget { sessions, drives, outdated };
-        self.commit(|done| Commit::Forget { forget, done }).await
+        self.commit(Write::Forget(forget)).await
     }
 
     /// Makes what was removed leave the disk, where anything was; whether it was. What was removed before a crash counts.
@@ -68,11 +71,11 @@ impl Journal {
     /// # Errors
     /// The store failed, or has no room to be written anew: it is still to be done.
     pub async fn erase(&self) -> Result<bool, JournalError> {
-        let Some(since) = self.store.erasure_due()? else { return Ok(false) };
-        let store = self.store.clone();
+        let store = self.store.get()?;
+        let Some(since) = store.erasure_due()? else { return Ok(false) };
         let erasing = tokio::task::spawn_blocking(move || store.erase_deleted());
         erasing.await.map_err(|error| JournalError::Store(format!("erasing: {error}")))??;
-        self.commit(|done| Commit::Erased { since, done }).await?;
+        self.commit(Write::Erased { since }).await?;
         Ok(true)
     }
 
@@ -87,7 +90,7 @@ impl Journal {
             let (drive, day) = decoded.map_err(|error| decode_error("a forgotten drive", &error))?;
             Ok(ForgottenDrive { drive, day })
         };
-        self.store.forgotten.iter().map(decode).collect()
+        self.store.get()?.forgotten.iter().map(decode).collect()
     }
 }
 
@@ -159,14 +162,24 @@ impl Store {
     fn settle(&self) -> Result<(), JournalError> {
         self.filler.insert("settled", [])?;
         for keyspace in self.keyspaces() {
-            keyspace.rotate_memtable_and_wait()?;
+            self.flush(keyspace)?;
         }
-        self.filler.rotate_memtable_and_wait()?;
+        self.flush(&self.filler)
+    }
+
+    /// Writes what a keyspace has in memory to tables, and waits for it.
+    fn flush(&self, keyspace: &Keyspace) -> Result<(), JournalError> {
+        keyspace.rotate_memtable()?;
+        while keyspace.sealed_memtable_count() > 0 {
+            // Fails where the store's own threads have: on a full disk they would be waited for for ever.
+            self.database.persist(PersistMode::Buffer)?;
+            thread::sleep(FLUSH_PAUSE);
+        }
         Ok(())
     }
 
-    fn keyspaces(&self) -> [&Keyspace; 6] {
-        [&self.records, &self.frames, &self.snapshots, &self.cuts, &self.facts, &self.forgotten]
+    fn keyspaces(&self) -> [&Keyspace; 7] {
+        [&self.records, &self.frames, &self.snapshots, &self.summaries, &self.cuts, &self.facts, &self.forgotten]
     }
 }
 
@@ -213,7 +226,8 @@ mod tests {
         let mut batch = store.batch();
         for (session, bytes) in [(gone, &gone_bytes), (kept, &kept_bytes)] {
             batch.put_frame(session, JournalFrame { sequence: Sequence(1), bytes: bytes.clone() });
-            let snapshot = Snapshot { covered: Sequence(0), state: bytes.clone(), erase: false };
+            let (state, summary) = (bytes.clone(), bytes.clone());
+            let snapshot = Snapshot { covered_before: None, covered: Sequence(0), state, summary, erase: false };
             batch.put_snapshot(session, snapshot).unwrap();
         }
         batch.commit().unwrap();

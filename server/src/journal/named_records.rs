@@ -69,7 +69,7 @@ mod tests {
     use lanemap_core::{Preset, Sensor};
 
     use super::*;
-    use crate::journal::Journal;
+    use crate::journal::{Journal, JournalOptions};
 
     /// A store as earlier builds left it: one record, as they laid it out.
     fn named_store(folder: &std::path::Path, id: SessionId, setup: &SessionSetup) {
@@ -93,12 +93,12 @@ mod tests {
             SessionRecord { id, drive: pseudonyms.drive(&key), vehicle, setup, cut: TripCut::default(), ended: true };
 
         for _ in 0..2 {
-            let (journal, thread) = Journal::open(folder.path(), 100).unwrap();
+            let (journal, thread) = Journal::open(&JournalOptions::new(folder.path())).unwrap();
             if journal.key_fingerprint().unwrap().is_none() {
                 journal.adopt_key(&pseudonyms).unwrap();
             }
             assert_eq!(journal.records().unwrap(), std::slice::from_ref(&expected));
-            assert!(!journal.store.database.keyspace_exists(NAMED));
+            assert!(!journal.store.get().unwrap().database.keyspace_exists(NAMED));
             drop(journal);
             thread.join().await;
         }

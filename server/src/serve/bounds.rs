@@ -6,6 +6,7 @@ use lanemap_core::geometry::georeference::Georeference;
 use nalgebra::Point3;
 
 use super::line::{Coordinate, written};
+use crate::session::published::extent;
 
 /// A box in degrees, with heights in metres where a query names them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,7 +61,13 @@ impl Bounds {
     /// points there are. Not guaranteed: to enclose them exactly ([`Bounds::loosened`] does).
     #[must_use]
     pub fn around(georeference: &Georeference, points_map: impl Iterator<Item = Point3<f64>>) -> Option<Self> {
-        let [low, high] = extent(points_map.map(|point| georeference.enu_from_map * point))?;
+        let corners = extent(points_map.map(|point| georeference.enu_from_map * point))?;
+        Self::around_extent(georeference, corners)
+    }
+
+    /// The box around an extent in east-north-up at the anchor, metres: lowest and highest corner.
+    #[must_use]
+    pub fn around_extent(georeference: &Georeference, [low, high]: [Point3<f64>; 2]) -> Option<Self> {
         let halves = [0.0, 0.5, 1.0];
         let border = halves.into_iter().flat_map(|x| halves.into_iter().map(move |y| (x, y))).map(|(x, y)| {
             let along = |axis: usize, part: f64| low[axis] + (high[axis] - low[axis]) * part;
@@ -136,13 +143,6 @@ impl Bounds {
     pub fn to_array(&self) -> [f64; 4] {
         [self.west, self.south, self.east, self.north]
     }
-}
-
-/// Lowest and highest corner of points; `None` without points.
-#[must_use]
-pub fn extent(mut points: impl Iterator<Item = Point3<f64>>) -> Option<[Point3<f64>; 2]> {
-    let first = points.next()?;
-    Some(points.fold([first, first], |[low, high], point| [low.inf(&point), high.sup(&point)]))
 }
 
 /// Liang and Barsky: whether a chord shares a point with an upright rectangle.

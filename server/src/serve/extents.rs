@@ -11,8 +11,8 @@ use std::{
     },
 };
 
-use super::{bounds::Bounds, sessions::control_points};
-use crate::session::{MapVersion, PublishedMap, SessionId, Sessions};
+use super::bounds::Bounds;
+use crate::session::{MapVersion, SessionId, SessionSummary, Sessions};
 
 /// The borders that are known. Clones share them; there is one per session, and the registry bounds the sessions.
 #[derive(Clone, Debug, Default)]
@@ -29,15 +29,15 @@ struct Known {
 }
 
 impl Extents {
-    /// The border of a map's lanes; `None` without lanes, or without a place on the earth.
+    /// The border of a session's lanes; `None` without lanes, or without a place on the earth.
     #[must_use]
-    pub fn of(&self, map: &PublishedMap) -> Option<Bounds> {
+    pub fn of(&self, map: &SessionSummary) -> Option<Bounds> {
         let georeference = map.georeference.as_ref()?;
         let known = self.lock().get(&map.session).copied();
         if let Some(known) = known.filter(|known| known.version == map.version) {
             return known.bounds;
         }
-        let bounds = Bounds::around(georeference, control_points(&map.map));
+        let bounds = map.extent.and_then(|corners| Bounds::around_extent(georeference, corners));
         self.lock().insert(map.session, Known { version: map.version, bounds });
         bounds
     }
@@ -46,7 +46,7 @@ impl Extents {
     pub fn drop_removed(&self, sessions: &Sessions) {
         let removals = sessions.removals();
         if self.removals.swap(removals, Ordering::Relaxed) != removals {
-            self.lock().retain(|session, _| sessions.get(session).is_some());
+            self.lock().retain(|session, _| sessions.contains(session));
         }
     }
 
@@ -58,18 +58,20 @@ impl Extents {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serve::sample::{georeference, published};
+    use crate::{
+        serve::sample::{georeference, placed, published},
+        session::PublishedMap,
+    };
     use lanemap_core::LaneMap;
 
     #[test]
     fn a_border_is_that_of_the_newest_version_and_goes_with_the_place_on_the_earth() {
         let extents = Extents::default();
-        let mut map = published(1, 3);
-        assert_eq!(extents.of(&map), None);
-        map.georeference = Some(georeference(11.58, 48.14));
+        assert_eq!(extents.of(&published(1, 3)), None);
+        let map = placed(published(1, 3), georeference(11.58, 48.14));
         let three_lanes = extents.of(&map).unwrap();
-        map.version = MapVersion(map.version.0 + 1);
-        map.map = Arc::new(LaneMap { lanes: map.map.lanes[..1].to_vec() });
+        let summary = SessionSummary { version: MapVersion(map.version.0 + 1), ..map.summary };
+        let map = PublishedMap::new(summary, Arc::new(LaneMap { lanes: map.map.lanes[..1].to_vec() }));
         let one_lane = extents.of(&map).unwrap();
         assert!(one_lane.west > three_lanes.west, "lanes lie side by side, to the west");
     }

@@ -250,12 +250,11 @@ pub fn category_name(category: Category) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serve::sample::{georeference, published};
+    use crate::serve::sample::{georeference, placed, published};
 
     #[test]
     fn a_georeferenced_map_is_valid_geojson_in_degrees_with_heights() {
-        let mut map = published(1, 3);
-        map.georeference = Some(georeference(11.58, 48.14));
+        let map = placed(published(1, 3), georeference(11.58, 48.14));
         let text = serde_json::to_string(&session_lanes(&map, Crs::Wgs84).unwrap()).unwrap();
         let collection: geojson::FeatureCollection = text.parse::<geojson::GeoJson>().unwrap().try_into().unwrap();
         assert_eq!(collection.features.len(), 3);
@@ -284,8 +283,7 @@ mod tests {
 
     #[test]
     fn every_coordinate_has_at_most_seven_decimals() {
-        let mut map = published(1, 3);
-        map.georeference = Some(georeference(11.58, 48.14));
+        let map = placed(published(1, 3), georeference(11.58, 48.14));
         let text = serde_json::to_string(&session_lanes(&map, Crs::Wgs84).unwrap()).unwrap();
         let longest = text
             .split(|c: char| !(c.is_ascii_digit() || c == '.'))

@@ -24,7 +24,7 @@ use super::{
     query::{Parameters, parse_limit},
     sessions::{GEOJSON, Link, identity},
 };
-use crate::session::{PublishedMap, SessionId};
+use crate::session::{PublishedMap, SessionId, SessionSummary, Sessions};
 
 /// Path of the collection's items.
 pub(super) const PATH: &str = "/collections/lanes/items";
@@ -87,53 +87,68 @@ pub(super) async fn items(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let query = PageQuery::read(&uri)?;
-    let maps = state.sessions.list();
+    let summaries = state.sessions.list();
     let asked = uri.query().unwrap_or_default().to_owned();
-    let tag = EntityTag::of((maps.iter().map(|map| identity(map)).collect::<Vec<_>>(), &asked));
+    let tag = EntityTag::of((summaries.iter().map(|summary| identity(summary)).collect::<Vec<_>>(), &asked));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let body = in_background(move || serde_json::to_vec(&page(&maps, &extents, &query, &asked))).await?;
+    let candidates = Candidates { summaries, sessions: state.sessions, extents };
+    let body = in_background(move || serde_json::to_vec(&page(&candidates, &query, &asked))).await?;
     let body = body.map_err(|_| Problem::Internal)?;
     Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
 }
 
+/// Where the lanes of a page are found.
+struct Candidates {
+    summaries: Vec<Arc<SessionSummary>>,
+    sessions: Sessions,
+    extents: Extents,
+}
+
 /// The page that a query asks for; `asked` is the query as it was written.
-fn page(maps: &[Arc<PublishedMap>], extents: &Extents, query: &PageQuery, asked: &str) -> Page {
+fn page(candidates: &Candidates, query: &PageQuery, asked: &str) -> Page {
     let mut features = Vec::new();
     let mut coordinates = 0;
     let mut more = false;
-    for (map, lane) in candidates(maps, extents, query) {
-        let Some(found) = feature(map, lane, Crs::Wgs84) else { continue };
-        if query.bounds.is_some_and(|bounds| !found.geometry.enters(&bounds)) {
-            continue;
+    'page: for map in candidates.maps(query) {
+        for lane in lanes(&map, query) {
+            let Some(found) = feature(&map, lane, Crs::Wgs84) else { continue };
+            if query.bounds.is_some_and(|bounds| !found.geometry.enters(&bounds)) {
+                continue;
+            }
+            if features.len() == query.limit || coordinates >= MOST_COORDINATES {
+                more = true;
+                break 'page;
+            }
+            coordinates += found.geometry.size();
+            features.push(found);
         }
-        if features.len() == query.limit || coordinates >= MOST_COORDINATES {
-            more = true;
-            break;
-        }
-        coordinates += found.geometry.size();
-        features.push(found);
     }
     Page { number_returned: features.len(), links: links(asked, features.last().filter(|_| more)), features }
 }
 
-/// The lanes after the cursor, by session and number, that may enter the box.
-fn candidates<'a>(
-    maps: &'a [Arc<PublishedMap>],
-    extents: &'a Extents,
-    query: &'a PageQuery,
-) -> impl Iterator<Item = (&'a PublishedMap, &'a MapLane)> {
-    maps.iter()
-        .map(Arc::as_ref)
-        .filter(|map| map.georeference.is_some())
-        .filter(|map| query.after_exclusive.is_none_or(|after| map.session >= after.session))
-        .filter(move |map| may_touch(query.bounds, || extents.of(map)))
-        .flat_map(|map| map.map.lanes.iter().map(move |lane| (map, lane)))
-        .filter(|(map, lane)| {
+impl Candidates {
+    /// The maps of georeferenced sessions from the cursor on that may enter the box, read one after the other.
+    fn maps(&self, query: &PageQuery) -> impl Iterator<Item = Arc<PublishedMap>> {
+        self.summaries
+            .iter()
+            .filter(|summary| summary.georeference.is_some())
+            .filter(|summary| query.after_exclusive.is_none_or(|after| summary.session >= after.session))
+            .filter(|summary| may_touch(query.bounds, || self.extents.of(summary)))
+            .filter_map(|summary| self.sessions.get(&summary.session))
+    }
+}
+
+/// The lanes of a map after the cursor that may enter the box.
+fn lanes<'a>(map: &'a PublishedMap, query: &'a PageQuery) -> impl Iterator<Item = &'a MapLane> {
+    map.map
+        .lanes
+        .iter()
+        .filter(|lane| {
             query.after_exclusive.is_none_or(|after| Cursor { session: map.session, lane: lane.id.0 } > after)
         })
-        .filter(move |(map, lane)| may_touch(query.bounds, || around(map, lane)))
+        .filter(|lane| may_touch(query.bounds, || around(map, lane)))
 }
 
 /// Whether what lies within the box `around` it may enter `bounds`; never wrong where it says no.
@@ -166,23 +181,28 @@ mod tests {
     use super::*;
     use crate::serve::{
         features::feature_id,
-        sample::{georeference, published},
+        sample::{georeference, placed, published},
     };
 
-    fn three_sessions() -> Vec<Arc<PublishedMap>> {
+    fn three_sessions() -> Vec<PublishedMap> {
         [(1, Some(11.58)), (2, None), (3, Some(11.60))]
             .into_iter()
             .map(|(number, longitude)| {
-                let mut map = published(number, 3);
-                map.georeference = longitude.map(|longitude| georeference(longitude, 48.14));
-                Arc::new(map)
+                let map = published(number, 3);
+                match longitude {
+                    Some(longitude) => placed(map, georeference(longitude, 48.14)),
+                    None => map,
+                }
             })
             .collect()
     }
 
     fn ask(query: &str) -> Page {
         let uri = format!("{PATH}?{query}").parse().unwrap();
-        page(&three_sessions(), &Extents::default(), &PageQuery::read(&uri).unwrap(), query)
+        let sessions = Sessions::default();
+        three_sessions().into_iter().for_each(|map| sessions.publish(map));
+        let candidates = Candidates { summaries: sessions.list(), sessions, extents: Extents::default() };
+        page(&candidates, &PageQuery::read(&uri).unwrap(), query)
     }
 
     #[test]

@@ -6,7 +6,7 @@ use axum::{
     response::IntoResponse,
 };
 
-use super::ServeState;
+use super::{Readiness, ServeState};
 use crate::telemetry;
 
 /// `GET /healthz`: the process answers.
@@ -14,12 +14,12 @@ pub(super) async fn healthz() -> impl IntoResponse {
     ([(header::CACHE_CONTROL, "no-store")], "ok\n")
 }
 
-/// `GET /readyz`: the service takes traffic; 503 while it starts and from the moment it shuts down.
+/// `GET /readyz`: the service takes traffic; 503 with the reason while frames cannot be made durable, and from the moment
+/// it shuts down.
 pub(super) async fn readyz(State(state): State<ServeState>) -> impl IntoResponse {
-    let (status, text) = if *state.ready.borrow() {
-        (StatusCode::OK, "ready\n")
-    } else {
-        (StatusCode::SERVICE_UNAVAILABLE, "not ready\n")
+    let (status, text) = match &*state.ready.borrow() {
+        Readiness::Ready => (StatusCode::OK, "ready\n".to_owned()),
+        Readiness::NotReady(reason) => (StatusCode::SERVICE_UNAVAILABLE, format!("not ready: {reason}\n")),
     };
     (status, [(header::CACHE_CONTROL, "no-store")], text)
 }

@@ -11,7 +11,7 @@ use lanemap_core::{
 };
 use nalgebra::{Matrix3, Point3, Translation3, UnitQuaternion};
 
-use crate::session::{MapVersion, PublishedMap, SessionId, SessionState};
+use crate::session::{MapVersion, PublishedMap, SessionId, SessionState, SessionSummary};
 
 /// Control points 3 m apart on a circle that climbs a little.
 pub fn bend(radius_m: f64, count: usize) -> Vec<Point3<f64>> {
@@ -52,17 +52,24 @@ pub fn published(number: u64, lanes: u64) -> PublishedMap {
             lane_of(id, points.collect())
         })
         .collect();
-    PublishedMap {
+    let summary = SessionSummary {
         session: SessionId::next(None, 0, number),
         version: MapVersion(12),
         state: SessionState::Live,
         preset: Preset::Default,
-        map: Arc::new(LaneMap { lanes }),
+        lanes: 0,
+        extent: None,
         map_from_vehicle: Pose::translation(10.0, 1.0, 0.0),
         last_sequence: Some(Sequence(12)),
         last_time: TimestampNs(1_700_000_001_200_000_000),
         georeference: None,
-    }
+    };
+    PublishedMap::new(summary, Arc::new(LaneMap { lanes }))
+}
+
+/// The same map at a place on the earth.
+pub fn placed(published: PublishedMap, georeference: Georeference) -> PublishedMap {
+    PublishedMap::new(SessionSummary { georeference: Some(georeference), ..published.summary }, published.map)
 }
 
 /// A map frame at a place, 520 m high, turned by a quarter: its x axis points north.

@@ -8,14 +8,13 @@ use axum::{
     http::{HeaderMap, Uri, header},
     response::Response,
 };
-use lanemap_core::{LaneMap, geometry::georeference::Wgs84};
+use lanemap_core::geometry::georeference::Wgs84;
 use nalgebra::{Isometry3, Point3};
 use prost::Message;
 use serde::Serialize;
 
 use super::{
     ServeState,
-    bounds::extent,
     entity_tag::EntityTag,
     extents::Extents,
     features::{Crs, rfc3339, session_lanes},
@@ -26,7 +25,7 @@ use super::{
 };
 use crate::{
     map_service::lane_map,
-    session::{PublishedMap, SessionId, SessionState, Sessions},
+    session::{PublishedMap, SessionId, SessionState, SessionSummary, Sessions},
 };
 
 /// Media type of GeoJSON.
@@ -122,11 +121,11 @@ pub(super) async fn list(
 }
 
 /// What tells one version of one session's map from all others.
-pub(super) fn identity(map: &PublishedMap) -> (u64, u64, bool) {
+pub(super) fn identity(map: &SessionSummary) -> (u64, u64, bool) {
     (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
 }
 
-fn entry(map: &PublishedMap, extents: &Extents) -> Entry {
+fn entry(map: &SessionSummary, extents: &Extents) -> Entry {
     let path = format!("/sessions/{}", map.session);
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
@@ -141,7 +140,7 @@ fn entry(map: &PublishedMap, extents: &Extents) -> Entry {
         id: map.session.to_string(),
         state: map.state,
         version: map.version.0,
-        lanes: map.map.lanes.len(),
+        lanes: map.lanes,
         frames: map.version.0,
         georeferenced: map.georeference.is_some(),
         last_frame_at: map.last_sequence.map(|_| rfc3339(map.last_time)),
@@ -151,19 +150,15 @@ fn entry(map: &PublishedMap, extents: &Extents) -> Entry {
     }
 }
 
-pub(super) fn control_points(lanes: &LaneMap) -> impl Iterator<Item = Point3<f64>> {
-    lanes.lanes.iter().flat_map(|lane| lane.control_points.iter().map(|point| point.position))
-}
-
-fn border(map: &PublishedMap, extents: &Extents) -> Option<[f64; 4]> {
+fn border(map: &SessionSummary, extents: &Extents) -> Option<[f64; 4]> {
     if map.georeference.is_some() {
         return extents.of(map).map(|bounds| bounds.to_array());
     }
-    let [low, high] = extent(control_points(&map.map))?.map(|corner| in_metres(&corner));
+    let [low, high] = map.extent?.map(|corner| in_metres(&corner));
     Some([low[0], low[1], high[0], high[1]])
 }
 
-fn vehicle(map: &PublishedMap) -> Vehicle {
+fn vehicle(map: &SessionSummary) -> Vehicle {
     let Some(georeference) = &map.georeference else {
         let (east, north) = forward(&map.map_from_vehicle);
         return Vehicle { position: in_metres(&origin(&map.map_from_vehicle)), heading_deg: heading_deg(east, north) };
@@ -201,7 +196,7 @@ pub(super) async fn lanes_geojson(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let crs = Parameters::read(&uri, &["crs"])?.get("crs", Crs::parse)?.unwrap_or(Crs::Wgs84);
-    let map = find(&state.sessions, &id)?;
+    let map = find(&state.sessions, &id).await?;
     if crs == Crs::Wgs84 && map.georeference.is_none() {
         return Err(Problem::NotGeoreferenced { session: map.session });
     }
@@ -222,7 +217,7 @@ pub(super) async fn lanes_protobuf(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     Parameters::read(&uri, &[])?;
-    let map = find(&state.sessions, &id)?;
+    let map = find(&state.sessions, &id).await?;
     let tag = EntityTag::of(identity(&map));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
@@ -231,33 +226,38 @@ pub(super) async fn lanes_protobuf(
     Ok(tag.on(([(header::CONTENT_TYPE, PROTOBUF)], body)))
 }
 
-fn find(sessions: &Sessions, id: &str) -> Result<Arc<PublishedMap>, Problem> {
-    id.parse()
-        .ok()
-        .and_then(|session| sessions.get(&session))
-        .ok_or_else(|| Problem::NoSuchSession { session: repeated(id) })
+/// The map of a session; where the session sleeps, it is read from the store.
+async fn find(sessions: &Sessions, id: &str) -> Result<Arc<PublishedMap>, Problem> {
+    let found = match id.parse() {
+        Ok(session) => {
+            let sessions = sessions.clone();
+            in_background(move || sessions.get(&session)).await?
+        }
+        Err(_) => None,
+    };
+    found.ok_or_else(|| Problem::NoSuchSession { session: repeated(id) })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serve::sample::{georeference, published};
+    use crate::serve::sample::{georeference, placed, published};
 
     #[test]
     fn a_vehicle_that_drives_along_an_axis_that_points_north_heads_north() {
-        let mut map = published(1, 1);
+        let map = published(1, 1);
         assert_eq!(vehicle(&map), Vehicle { position: [10.0, 1.0, 0.0], heading_deg: 90.0 });
-        map.georeference = Some(georeference(-170.0, 60.0));
+        let map = placed(map, georeference(-170.0, 60.0));
         let on_the_earth = vehicle(&map);
         assert!(on_the_earth.heading_deg.min(360.0 - on_the_earth.heading_deg) < 0.1, "{on_the_earth:?}");
     }
 
     #[test]
     fn an_entry_of_the_list_has_the_border_of_its_lanes() {
-        let mut map = published(1, 2);
+        let map = published(1, 2);
         let local = border(&map, &Extents::default()).unwrap();
         assert!(local[0].abs() < 1e-9 && local[2] > 50.0, "{local:?}");
-        map.georeference = Some(georeference(11.58, 48.14));
+        let map = placed(map, georeference(11.58, 48.14));
         let [west, south, east, north] = border(&map, &Extents::default()).unwrap();
         assert!(west < east && east <= 11.58 && (48.14..48.141).contains(&north) && south < north);
     }
@@ -265,7 +265,7 @@ mod tests {
     #[test]
     fn a_session_that_has_seen_no_frame_has_neither_border_nor_vehicle() {
         let mut map = published(1, 0);
-        map.last_sequence = None;
+        map.summary.last_sequence = None;
         let entry = serde_json::to_value(entry(&map, &Extents::default())).unwrap();
         assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
         assert_eq!(entry["state"], "live");

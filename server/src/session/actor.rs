@@ -1,6 +1,7 @@
 //! The actor of one session: the only owner of the drive's mapper.
 //!
-//! It gathers the frames that are waiting, makes them durable in one commit, acks them, maps them, and sends poses back.
+//! It gathers the frames that are waiting, puts them in order, makes them durable in one commit, acks them, maps them, and
+//! sends poses back.
 //! It publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
 //! snapshot every so many frames, when the drive ends, and before it leaves memory.
 
@@ -21,8 +22,11 @@ use tonic::Status;
 use super::{
     SessionRecord, SessionState, Sessions,
     drive::{Admission, Drive, DriveError, Loaded},
+    in_flight::{FramePlace, InFlightBudget},
     mapping_turns::MappingTurns,
+    published::state_without_stream,
     registry::{self, blocking},
+    reorder::{Offer, Passed, Reorder},
 };
 use crate::{
     config::ServerConfig,
@@ -33,8 +37,8 @@ use crate::{
     telemetry,
 };
 
-/// Steps of a mapper between two chances for other tasks to run: about a millisecond.
-const STEPS_IN_A_ROW: usize = 8;
+/// Time of mapping between two chances for other tasks to run.
+const LONGEST_RUN: Duration = Duration::from_millis(1);
 /// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
 
@@ -48,13 +52,25 @@ pub(crate) enum Command {
     /// A stream of the vehicle opens; a stream before it is superseded.
     Attach(Attach),
     /// A validated frame.
-    Frame { stream: StreamNumber, frame: Box<Frame>, arrived: Instant },
+    Frame { stream: StreamNumber, arrival: Box<Arrival> },
+    /// A frame of this number was refused before it got here.
+    Refused { stream: StreamNumber, sequence: Sequence },
     /// The drive is over.
     End { stream: StreamNumber },
     /// The stream closes; what it was promised is sent first, then `with`.
     Detach { stream: StreamNumber, with: Result<(), Status> },
     /// The drive is to be deleted: the actor leaves at once and saves nothing.
     Forget,
+}
+
+/// A frame that came, and its place among those in flight.
+#[derive(Debug)]
+pub(crate) struct Arrival {
+    pub(crate) frame: Frame,
+    pub(crate) arrived: Instant,
+    /// Held until the frame is mapped.
+    #[expect(dead_code, reason = "held, not read")]
+    pub(crate) place: FramePlace,
 }
 
 /// A stream that opens.
@@ -82,6 +98,7 @@ pub(crate) struct Surroundings {
     pub(crate) journal: Journal,
     pub(crate) pseudonyms: Pseudonyms,
     pub(crate) sessions: Sessions,
+    pub(crate) in_flight: InFlightBudget,
     pub(crate) shutdown: CancellationToken,
 }
 
@@ -89,6 +106,7 @@ pub(crate) struct Actor {
     surroundings: Surroundings,
     record: SessionRecord,
     drive: Drive,
+    reorder: Reorder<Early>,
     commands: mpsc::Receiver<Command>,
     /// The actors that are running, this one among them.
     actors: TaskTracker,
@@ -97,6 +115,8 @@ pub(crate) struct Actor {
     unpublished: bool,
     next_publication: Instant,
     unload_at: Instant,
+    /// The last frame in the snapshot that the store has.
+    covered: Option<Sequence>,
     frames_since_snapshot: u64,
     /// It takes no new stream: it saves the drive and ends.
     leaving: bool,
@@ -109,10 +129,17 @@ struct Stream {
     gone: CancellationToken,
 }
 
+/// A frame that may have come too early, and the bytes under which it is journaled.
+#[derive(Debug)]
+struct Early {
+    arrival: Box<Arrival>,
+    bytes: Vec<u8>,
+}
+
 /// Frames admitted, not yet durable.
 #[derive(Default)]
 struct Batch {
-    frames: Vec<(Frame, Instant)>,
+    frames: Vec<Box<Arrival>>,
     journal: Vec<JournalFrame>,
     repeated: bool,
     /// Frames that were cut: they are acked once it is durable how far the drive has come. Never beside other frames.
@@ -139,19 +166,34 @@ impl Batch {
     }
 }
 
+impl From<ActorError> for Status {
+    fn from(error: ActorError) -> Self {
+        match error {
+            ActorError::Journal(error) => Error::from(error).into(),
+            ActorError::Drive(_) => Self::internal(error.to_string()),
+            ActorError::Forgotten => Error::Forgotten.into(),
+        }
+    }
+}
+
 impl Actor {
     pub(crate) fn new(
         surroundings: Surroundings,
-        Loaded { record, drive, replayed }: Loaded,
+        Loaded { record, drive, covered, replayed }: Loaded,
         commands: mpsc::Receiver<Command>,
         actors: TaskTracker,
         mapping_turns: MappingTurns,
     ) -> Self {
         let now = Instant::now();
+        let config = &surroundings.config;
+        // Frames that wait are in flight: with a window of one more, those that they wait for still come through.
+        let window = config.reorder_window_frames.min(config.max_frames_in_flight - 1);
+        let reorder = Reorder::new(window, config.reorder_wait(), drive.last_sequence());
         let mut actor = Self {
             surroundings,
             record,
             drive,
+            reorder,
             commands,
             actors,
             mapping_turns,
@@ -159,6 +201,7 @@ impl Actor {
             unpublished: false,
             next_publication: now,
             unload_at: now,
+            covered,
             frames_since_snapshot: replayed,
             leaving: false,
         };
@@ -169,15 +212,14 @@ impl Actor {
     /// Runs until the session leaves memory, the service shuts down, or the journal fails.
     pub(crate) async fn run(mut self) {
         if let Err(error) = self.serve().await {
-            if matches!(error, ActorError::Forgotten) {
-                if let Some(stream) = self.stream.take() {
-                    stream.outbox.finish(Err(Error::Forgotten.into()));
-                }
-                return;
+            if !matches!(error, ActorError::Forgotten) {
+                tracing::error!(session = %self.record.id, %error, "the session ends");
             }
-            tracing::error!(session = %self.record.id, %error, "the session ends");
-            let status = Status::unavailable(error.to_string());
-            self.detach(Err(status));
+            // Not published: of what was admitted, some is not durable.
+            self.surroundings.sessions.fall_asleep(&self.record.id, state_without_stream(&self.record));
+            if let Some(stream) = self.stream.take() {
+                stream.outbox.finish(Err(error.into()));
+            }
         }
     }
 
@@ -191,6 +233,7 @@ impl Actor {
         }
         self.save().await?;
         self.publish();
+        self.surroundings.sessions.fall_asleep(&self.record.id, state_without_stream(&self.record));
         Ok(())
     }
 
@@ -198,6 +241,7 @@ impl Actor {
     async fn serve_next(&mut self) -> Result<bool, ActorError> {
         let gone = self.stream.as_ref().map(|stream| stream.gone.clone());
         let detached = gone.is_none();
+        let overdue = self.reorder.deadline();
         tokio::select! {
             biased;
             command = self.commands.recv() => match command {
@@ -205,6 +249,7 @@ impl Actor {
                 None => return Ok(false),
             },
             () = sleep_until(self.next_publication), if self.unpublished => self.publish(),
+            () = sleep_until_some(overdue) => self.give_up_overdue().await?,
             () = cancelled(gone) => self.detach(Ok(())),
             () = sleep_until(self.unload_at), if detached => {
                 // Frames are held no longer than a trip pauses.
@@ -220,26 +265,42 @@ impl Actor {
     async fn take(&mut self, first: Command) -> Outcome {
         let mut batch = Batch::default();
         let mut next = Some(first);
+        let mut taken = 0;
         while let Some(command) = next {
+            taken += 1;
             match command {
-                Command::Frame { stream, frame, arrived } => self.admit(stream, *frame, arrived, &mut batch).await?,
+                Command::Frame { stream, arrival } => self.take_frame(stream, arrival, &mut batch).await?,
+                Command::Refused { stream, sequence } => {
+                    if self.is_current(stream) {
+                        self.reorder.refused(sequence);
+                        self.pass_due(&mut batch).await?;
+                    }
+                }
                 Command::Attach(attach) => {
                     self.commit(&mut batch).await?;
                     self.attach(attach);
                 }
                 Command::End { stream } => {
+                    if self.is_current(stream) {
+                        self.pass_all(&mut batch).await?;
+                    }
                     self.commit(&mut batch).await?;
                     self.end(stream).await?;
                 }
                 Command::Forget => return Err(ActorError::Forgotten),
                 Command::Detach { stream, with } => {
+                    // A stream that was closed in order brings nothing more; one that broke is resumed, and what is
+                    // missing may come yet.
+                    if with.is_ok() && self.is_current(stream) && !self.nobody_reads() {
+                        self.pass_all(&mut batch).await?;
+                    }
                     self.commit(&mut batch).await?;
                     if self.is_current(stream) {
                         self.detach(with);
                     }
                 }
             }
-            let full = batch.frames.len() >= self.surroundings.config.max_frames_in_flight;
+            let full = taken >= self.surroundings.config.max_frames_in_flight;
             next = if full { None } else { self.commands.try_recv().ok() };
         }
         self.commit(&mut batch).await?;
@@ -259,6 +320,8 @@ impl Actor {
         if let Some(before) = self.stream.take() {
             before.outbox.finish(Err(Error::Superseded.into()));
         }
+        // What the stream before left unfinished was not acked: it comes again.
+        self.reorder.restart(self.drive.last_sequence());
         let attached = Attached { last: self.drive.last_sequence(), ended: self.record.ended };
         if attach.attached.send(attached).is_err() {
             return self.detach(Ok(()));
@@ -274,6 +337,7 @@ impl Actor {
 
     fn detach(&mut self, with: Result<(), Status>) {
         let stream = self.stream.take();
+        self.reorder.restart(self.drive.last_sequence());
         self.unload_at = self.unload_time();
         // Published before the vehicle hears of it: who waits for the end of a stream reads all of its frames.
         self.publish();
@@ -296,31 +360,101 @@ impl Actor {
         }
     }
 
-    /// Puts a frame into the batch where it is next in its drive.
-    async fn admit(&mut self, stream: StreamNumber, frame: Frame, arrived: Instant, batch: &mut Batch) -> Outcome {
-        let current = self.stream.as_ref().filter(|current| current.number == stream);
-        let Some(outbox) = current.map(|current| current.outbox.clone()) else { return Ok(()) };
-        if self.record.ended {
-            let limit = "no frame after the end of the drive";
-            let refusal = Refusal::new(RefusalReason::OutOfTurn, "frame", "a frame", limit).of_frame(frame.sequence());
-            outbox.refuse(&refusal).await;
+    fn nobody_reads(&self) -> bool {
+        self.stream.as_ref().is_some_and(|stream| stream.outbox.is_closed())
+    }
+
+    /// Takes a frame of the stream that is open: it passes, waits for those before it, or is refused.
+    async fn take_frame(&mut self, stream: StreamNumber, arrival: Box<Arrival>, batch: &mut Batch) -> Outcome {
+        if !self.is_current(stream) {
             return Ok(());
         }
-        let bytes = frame_bytes(&frame)?;
-        if batch.must_precede(self.drive.would_cut(&frame)) {
+        let sequence = arrival.frame.sequence();
+        if self.record.ended {
+            let limit = "no frame after the end of the drive";
+            let refusal = Refusal::new(RefusalReason::OutOfTurn, "frame", "a frame", limit);
+            self.refuse(&refusal.of_frame(sequence)).await;
+            return Ok(());
+        }
+        let bytes = frame_bytes(&arrival.frame)?;
+        let early = Early { arrival, bytes };
+        if self.reorder.has_passed(sequence) {
+            return self.admit(early, batch).await;
+        }
+        let arrived = early.arrival.arrived;
+        match self.reorder.offer(sequence, early, arrived) {
+            Offer::Taken => self.pass_due(batch).await,
+            Offer::Held { before, again } if before.bytes == again.bytes => {
+                metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
+                Ok(())
+            }
+            Offer::Held { .. } => {
+                self.refuse(&given_twice(sequence)).await;
+                Ok(())
+            }
+        }
+    }
+
+    /// Admits what need not wait any more.
+    async fn pass_due(&mut self, batch: &mut Batch) -> Outcome {
+        let now = Instant::now();
+        while let Some(passed) = self.reorder.pass(now) {
+            self.take_passed(passed, batch).await?;
+        }
+        Ok(())
+    }
+
+    /// Admits what is held, since nothing more comes.
+    async fn pass_all(&mut self, batch: &mut Batch) -> Outcome {
+        while let Some(passed) = self.reorder.pass_last() {
+            self.take_passed(passed, batch).await?;
+        }
+        Ok(())
+    }
+
+    async fn take_passed(&mut self, passed: Passed<Early>, batch: &mut Batch) -> Outcome {
+        match passed {
+            Passed::Frame(early) => self.admit(early, batch).await,
+            Passed::Gap(missing) => {
+                if let Some(stream) = &self.stream {
+                    stream.outbox.gap(&missing).await;
+                }
+                Ok(())
+            }
+        }
+    }
+
+    /// Gives up frames that did not come in time.
+    async fn give_up_overdue(&mut self) -> Outcome {
+        let mut batch = Batch::default();
+        self.pass_due(&mut batch).await?;
+        self.commit(&mut batch).await?;
+        self.publish_if_due();
+        Ok(())
+    }
+
+    async fn refuse(&self, refusal: &Refusal) {
+        if let Some(stream) = &self.stream {
+            stream.outbox.refuse(refusal).await;
+        }
+    }
+
+    /// Puts a frame into the batch where it is next in its drive.
+    async fn admit(&mut self, Early { arrival, bytes }: Early, batch: &mut Batch) -> Outcome {
+        if batch.must_precede(self.drive.would_cut(&arrival.frame)) {
             self.commit(batch).await?;
         }
-        match self.drive.admit(&frame, &bytes) {
+        match self.drive.admit(&arrival.frame, &bytes) {
             Admission::Cut => batch.cut += 1,
             Admission::New => {
-                batch.journal.push(JournalFrame { sequence: frame.sequence(), bytes });
-                batch.frames.push((frame, arrived));
+                batch.journal.push(JournalFrame { sequence: arrival.frame.sequence(), bytes });
+                batch.frames.push(arrival);
             }
             Admission::Repeated => {
                 metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
                 batch.repeated = true;
             }
-            Admission::Refused(refusal) => outbox.refuse(&refusal).await,
+            Admission::Refused(refusal) => self.refuse(&refusal).await,
         }
         Ok(())
     }
@@ -339,8 +473,8 @@ impl Actor {
         }
         self.surroundings.journal.append(self.record.id, journal).await?;
         self.ack();
-        for (_, arrived) in &frames {
-            metrics::histogram!(telemetry::ACK_SECONDS).record(arrived.elapsed().as_secs_f64());
+        for arrival in &frames {
+            metrics::histogram!(telemetry::ACK_SECONDS).record(arrival.arrived.elapsed().as_secs_f64());
         }
         metrics::counter!(telemetry::FRAMES_ACKED).increment(frames.len() as u64);
         self.frames_since_snapshot += frames.len() as u64;
@@ -348,7 +482,7 @@ impl Actor {
             let ready = self.ready_frames().await?;
             self.map_all(ready.iter()).await;
         } else {
-            self.map_all(frames.iter().map(|(frame, _)| frame)).await;
+            self.map_all(frames.iter().map(|arrival| &arrival.frame)).await;
         }
         if self.frames_since_snapshot >= self.surroundings.config.snapshot_every_frames {
             self.save().await?;
@@ -373,18 +507,18 @@ impl Actor {
     async fn ready_frames(&self) -> Result<Vec<Frame>, JournalError> {
         let Some(through) = self.drive.ready() else { return Ok(Vec::new()) };
         let (journal, session, covered) = (self.surroundings.journal.clone(), self.record.id, self.drive.covered());
-        blocking(move || journal.frames_between(session, covered, through).collect()).await
+        blocking(move || journal.frames_between(session, covered, through)?.collect()).await
     }
 
     async fn map_all(&mut self, frames: impl Iterator<Item = &Frame>) {
         let turns = self.mapping_turns.clone();
-        let mut turn = turns.take().await;
-        for (index, frame) in frames.enumerate() {
+        let (mut turn, mut began) = (turns.take().await, Instant::now());
+        for frame in frames {
             self.map(frame);
-            if (index + 1) % STEPS_IN_A_ROW == 0 {
+            if began.elapsed() >= LONGEST_RUN {
                 drop(turn);
                 tokio::task::yield_now().await;
-                turn = turns.take().await;
+                (turn, began) = (turns.take().await, Instant::now());
             }
         }
         drop(turn);
@@ -436,8 +570,11 @@ impl Actor {
         };
         // Frames of a trip's ends, and where it set out.
         let erase = self.drive.holds_back();
-        let snapshot = Snapshot { covered, state: self.drive.snapshot()?, erase };
+        let state = self.drive.snapshot()?;
+        let summary = self.drive.summary_bytes(self.record.id, state_without_stream(&self.record))?;
+        let snapshot = Snapshot { covered_before: self.covered, covered, state, summary, erase };
         self.surroundings.journal.put_snapshot(self.record.id, snapshot).await?;
+        self.covered = Some(covered);
         self.frames_since_snapshot = 0;
         Ok(())
     }
@@ -470,6 +607,19 @@ impl Actor {
         let sessions_per_core = u32::try_from(sessions_per_core).unwrap_or(u32::MAX).max(1);
         self.surroundings.config.publish_interval().max(took.saturating_mul(PUBLISH_SHARE * sessions_per_core))
     }
+}
+
+async fn sleep_until_some(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}
+
+fn given_twice(sequence: Sequence) -> Refusal {
+    let value = format!("{} again, with other content", sequence.0);
+    let limit = "the frame that waits under this number";
+    Refusal::new(RefusalReason::Sequence, "frame.sequence", value, limit).of_frame(sequence)
 }
 
 async fn cancelled(token: Option<CancellationToken>) {

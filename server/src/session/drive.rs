@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::{
-    MapVersion, PublishedMap, SessionId, SessionRecord, SessionSetup, SessionState,
+    MapVersion, PublishedMap, SessionId, SessionRecord, SessionSetup, SessionState, SessionSummary,
     recent::{REMEMBERED, RecentFrames, Recollection},
 };
 use crate::{
@@ -29,15 +29,6 @@ pub(crate) struct Drive {
     ends: Ends,
 }
 
-/// A drive as the store knows it.
-#[derive(Debug)]
-pub(crate) struct Loaded {
-    pub(crate) record: SessionRecord,
-    pub(crate) drive: Drive,
-    /// Frames after its snapshot.
-    pub(crate) replayed: u64,
-}
-
 /// What is cut off the ends of a drive's trips. Stands still where nothing is cut.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Ends {
@@ -50,6 +41,17 @@ struct Ends {
     ready: Option<Sequence>,
     /// The last frame that was mapped.
     mapped: Option<(Sequence, TimestampNs)>,
+}
+
+/// A drive as the store knows it.
+#[derive(Debug)]
+pub(crate) struct Loaded {
+    pub(crate) record: SessionRecord,
+    pub(crate) drive: Drive,
+    /// The last frame in its snapshot.
+    pub(crate) covered: Option<Sequence>,
+    /// Frames after the snapshot, mapped again.
+    pub(crate) replayed: u64,
 }
 
 /// How far a drive has come.
@@ -97,11 +99,13 @@ impl Loaded {
             Some(bytes) => Drive::restore(&bytes, record.cut).map_err(damaged_state)?,
             None => Drive::new(&record.setup, record.cut),
         };
+        // Before the mark: frames that were held until the trip stopped may lie after it, and go with the next snapshot.
+        let covered = drive.covered();
         if let Some(mark) = journal.cut_mark(record.id)? {
             drive.apply_cut_mark(&mark).map_err(damaged_state)?;
         }
         let mut replayed = 0;
-        for frame in journal.frames_after(record.id, drive.covered()) {
+        for frame in journal.frames_after(record.id, drive.covered())? {
             let frame = frame?;
             replayed += 1;
             if drive.replay(&frame).map_err(|refusal| damaged("the session's journal", refusal.to_string()))? {
@@ -111,14 +115,14 @@ impl Loaded {
                 drive.map(&ready);
             }
         }
-        Ok(Self { record, drive, replayed })
+        Ok(Self { record, drive, covered, replayed })
     }
 }
 
 /// The frames that were held back and may be mapped now. Reads the disk.
 pub(crate) fn ready_frames(journal: &Journal, session: SessionId, drive: &Drive) -> Result<Vec<Frame>, JournalError> {
     let Some(through) = drive.ready() else { return Ok(Vec::new()) };
-    journal.frames_between(session, drive.covered(), through).collect()
+    journal.frames_between(session, drive.covered(), through)?.collect()
 }
 
 impl Drive {
@@ -280,19 +284,27 @@ impl Drive {
         if self.cut.is_on() { self.ends.mapped } else { self.progress.last }
     }
 
+    /// What is told of the drive while it sleeps, as bytes; nothing where it is hidden.
+    pub(crate) fn summary_bytes(&self, session: SessionId, state: SessionState) -> Result<Vec<u8>, DriveError> {
+        let told = (!self.is_hidden()).then(|| self.published(session, state).summary);
+        Ok(postcard::to_stdvec(&told)?)
+    }
+
     /// What readers are shown.
     pub(crate) fn published(&self, session: SessionId, state: SessionState) -> PublishedMap {
-        PublishedMap {
+        let summary = SessionSummary {
             session,
             version: MapVersion(self.progress.mapped),
             state,
             preset: self.mapper.params().preset,
-            map: Arc::new(self.mapper.lane_map()),
             map_from_vehicle: self.mapper.map_from_vehicle(),
             last_sequence: self.last_shown().map(|(sequence, _)| sequence),
             last_time: self.last_shown().map_or(TimestampNs(0), |(_, time)| time),
             georeference: self.mapper.georeference(),
-        }
+            lanes: 0,
+            extent: None,
+        };
+        PublishedMap::new(summary, Arc::new(self.mapper.lane_map()))
     }
 }
 

@@ -1,7 +1,7 @@
 //! Finds or begins the session of a drive, and keeps one actor per session.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, HashSet},
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicU64, Ordering},
@@ -9,11 +9,12 @@ use std::{
     time::{SystemTime, UNIX_EPOCH},
 };
 
-use futures::{StreamExt, future, stream};
+use lanemap_core::Frame;
 use lanemap_proto::v1::RefusalReason;
 use tokio::{
     sync::{Mutex as AsyncMutex, OwnedSemaphorePermit, Semaphore, mpsc, oneshot},
     task::JoinHandle,
+    time::Instant,
 };
 use tokio_util::{
     sync::{CancellationToken, DropGuard},
@@ -22,16 +23,18 @@ use tokio_util::{
 use tonic::Status;
 
 use super::{
-    SessionId, SessionKey, SessionRecord, SessionState,
-    actor::{Actor, Attach, Attached, Command, StreamNumber, Surroundings},
+    PublishedMap, SessionId, SessionKey, SessionRecord, SessionSummary,
+    actor::{Actor, Arrival, Attach, Attached, Command, StreamNumber, Surroundings},
     drive::Loaded,
     forget::Forgotten,
+    in_flight::SessionInFlight,
     mapping_turns::MappingTurns,
+    published::state_without_stream,
 };
 use crate::{
     error::Error,
     ingest::{Outbox, Refusal, decode::Start},
-    journal::JournalError,
+    journal::{Journal, JournalError},
     privacy::{DrivePseudonym, Pseudonyms, VehiclePseudonym},
     telemetry,
 };
@@ -80,6 +83,8 @@ pub(super) struct Shared {
     streams: AtomicU64,
     actors: TaskTracker,
     mapping_turns: MappingTurns,
+    /// Drives that are read from the store at a time.
+    loads: Semaphore,
 }
 
 /// Where a drive is kept.
@@ -108,25 +113,28 @@ pub(crate) struct Attachment {
     pub(crate) at: Attached,
     commands: mpsc::Sender<Command>,
     stream: StreamNumber,
+    in_flight: SessionInFlight,
     _gone: DropGuard,
-    _live: LivePermit,
 }
 
 impl SessionRegistry {
-    /// Reads every session of the store and publishes its map.
-    ///
-    /// A session that cannot be read is reported and left as it is; the others are served.
+    /// Reads what is told of every session of the store. Maps are read when they are asked for, drives when they are
+    /// resumed: a start takes no longer for a store of many drives.
     pub(crate) async fn recover(surroundings: Surroundings) -> Result<Self, JournalError> {
         let journal = surroundings.journal.clone();
-        let (records, forgotten) = blocking(move || Ok((journal.records()?, journal.forgotten()?))).await?;
+        let read = move || Ok((journal.records()?, journal.forgotten()?, journal.summaries()?));
+        let (records, forgotten, summaries) = blocking(read).await?;
         let mut slots = HashMap::with_capacity(records.len());
         let last_id = records.last().map(|record| record.id);
-        let recovering = stream::iter(&records).map(|record| recover_one(&surroundings, record));
-        let holding: Vec<Loaded> = recovering.buffer_unordered(cores()).filter_map(future::ready).collect().await;
         for record in records {
+            if let Some(summary) = summary_of(&record, summaries.get(&record.id).map(Vec::as_slice)) {
+                surroundings.sessions.add_asleep(&summary);
+            }
             let slot = Slot { record: Some(record.clone()), ..Slot::default() };
             slots.insert(record.drive, Place { vehicle: record.vehicle, slot: Arc::new(AsyncMutex::new(slot)) });
         }
+        let journal = surroundings.journal.clone();
+        surroundings.sessions.read_with(move |session| read_published(&journal, session));
         metrics::gauge!(telemetry::SESSIONS).set(slots.len() as f64);
         let shared = Shared {
             live: Arc::new(Semaphore::new(surroundings.config.max_live_sessions)),
@@ -138,16 +146,39 @@ impl SessionRegistry {
             streams: AtomicU64::new(0),
             actors: TaskTracker::new(),
             mapping_turns: MappingTurns::new(),
+            loads: Semaphore::new(cores()),
         };
-        for loaded in holding {
-            shared.resume(loaded);
-        }
         Ok(Self { shared: Arc::new(shared) })
+    }
+
+    /// Wakes the drives that have frames after their snapshot, one after the other: a crash left them so, or they hold
+    /// frames of a trip that may be over. They fall asleep again, with a new snapshot, unless their vehicles come back.
+    pub(crate) async fn wake_unsaved(&self) -> Result<(), Error> {
+        let Surroundings { journal, sessions, .. } = self.shared.surroundings.clone();
+        let told: HashMap<_, _> = sessions.list().iter().map(|told| (told.session, told.last_sequence)).collect();
+        let find = move || {
+            let records = journal.records()?.into_iter();
+            // Nothing is told of one that is hidden.
+            journal.with_frames_after(records.map(|record| (record.id, told.get(&record.id).copied().flatten())))
+        };
+        let unsaved: HashSet<_> = blocking(find).await?.into_iter().collect();
+        let slots: Vec<_> = locked(&self.shared.slots).values().map(|place| Arc::clone(&place.slot)).collect();
+        for slot in slots {
+            let mut slot = slot.lock().await;
+            let Some(record) = slot.record.clone().filter(|record| unsaved.contains(&record.id)) else { continue };
+            if slot.actor.is_none() {
+                let (nobody, _) = Outbox::new();
+                self.actor(&mut slot, &record, &nobody).await?;
+            }
+        }
+        Ok(())
     }
 
     /// Opens a stream of a drive: begins the drive or resumes it, and supersedes a stream that is still open.
     pub(crate) async fn open(&self, start: &Start, outbox: &Outbox) -> Result<Attachment, OpenError> {
-        let live = self.live_permit().map_err(OpenError::Refused)?;
+        // Where a write failed, what a drive had durable is known only once the journal takes writes again.
+        self.shared.surroundings.journal.health().borrow().check().map_err(Error::from)?;
+        self.check_load()?;
         let slot = self.slot(start)?;
         let mut slot = slot.lock().await;
         // It may have been deleted while this waited for it.
@@ -162,7 +193,8 @@ impl SessionRegistry {
             let gone = CancellationToken::new();
             if let Some(at) = attach(&commands, stream, start, outbox, &gone).await {
                 let session = record.id;
-                return Ok(Attachment { session, at, commands, stream, _gone: gone.drop_guard(), _live: live });
+                let in_flight = self.shared.surroundings.in_flight.session();
+                return Ok(Attachment { session, at, commands, stream, in_flight, _gone: gone.drop_guard() });
             }
         }
         Err(OpenError::Failed(Error::SessionGone))
@@ -174,10 +206,29 @@ impl SessionRegistry {
         self.shared.actors.wait().await;
     }
 
-    fn live_permit(&self) -> Result<LivePermit, Refusal> {
-        let maximum = self.shared.surroundings.config.max_live_sessions;
+    /// Reads no more maps from the store, which is to be closed.
+    pub(crate) fn let_go_of_store(&self) {
+        self.shared.surroundings.sessions.let_go_of_store();
+    }
+
+    /// A place among the streams that may be open at a time.
+    pub(crate) fn stream_place(&self) -> Result<StreamPlace, Error> {
+        let limit = self.shared.surroundings.config.max_live_sessions;
         let permit = Arc::clone(&self.shared.live).try_acquire_owned();
-        permit.map(LivePermit::new).map_err(|_| capacity("streams", maximum))
+        permit.map(StreamPlace::new).map_err(|_| Error::TooManyStreams { limit })
+    }
+
+    /// Refuses a stream while those that are open are more than the disk or the mappers keep up with.
+    fn check_load(&self) -> Result<(), Error> {
+        let Surroundings { config, journal, in_flight, .. } = &self.shared.surroundings;
+        let overloaded = |what| Err(Error::Overloaded { what });
+        if journal.is_overloaded() {
+            return overloaded(format!("{} writes wait for the disk", config.max_waiting_commits));
+        }
+        if in_flight.is_used_up() {
+            return overloaded(format!("{} bytes of frames wait to be mapped", config.max_bytes_in_flight));
+        }
+        Ok(())
     }
 
     fn check_not_forgotten(&self, drive: DrivePseudonym) -> Result<(), Error> {
@@ -273,8 +324,11 @@ impl SessionRegistry {
         let journal = self.shared.surroundings.journal.clone();
         // The record may have ended since the slot was filled: the store knows.
         let (session, record) = (record.id, record.clone());
-        let loaded = blocking(move || Loaded::read(&journal, record)).await;
-        let loaded = loaded.map_err(|error| unreadable(session, &error))?;
+        let loaded = {
+            // It maps frames: more at a time than there are cores would only delay those that stream already.
+            let _turn = self.shared.loads.acquire().await;
+            blocking(move || Loaded::read(&journal, record)).await.map_err(|error| unreadable(session, error))?
+        };
         slot.record = Some(loaded.record.clone());
         let actor = self.shared.begin_actor(loaded, outbox.clone());
         let commands = actor.commands.clone();
@@ -290,37 +344,34 @@ impl Shared {
             Actor::new(self.surroundings.clone(), loaded, waiting, self.actors.clone(), self.mapping_turns.clone());
         ActorHandle { commands, outbox, task: self.actors.spawn(actor.run()) }
     }
-
-    /// Gives a drive an actor before any stream does.
-    fn resume(&self, loaded: Loaded) {
-        let record = loaded.record.clone();
-        let actor = self.begin_actor(loaded, Outbox::new().0);
-        let slot = Slot { record: Some(record.clone()), actor: Some(actor) };
-        let place = Place { vehicle: record.vehicle, slot: Arc::new(AsyncMutex::new(slot)) };
-        locked(&self.slots).insert(record.drive, place);
-    }
 }
 
 impl Attachment {
+    /// Hands a frame to the actor; waits where as many are in flight as may be.
+    pub(crate) async fn send_frame(&self, frame: Frame, arrived: Instant) -> Result<(), Error> {
+        let place = self.in_flight.place(&frame).await.map_err(|_| Error::SessionGone)?;
+        self.send(|stream| Command::Frame { stream, arrival: Box::new(Arrival { frame, arrived, place }) }).await
+    }
+
     /// Hands a command to the actor; waits where the session's queue is full.
     pub(crate) async fn send(&self, command: impl FnOnce(StreamNumber) -> Command) -> Result<(), Error> {
         self.commands.send(command(self.stream)).await.map_err(|_| Error::SessionGone)
     }
 }
 
-/// A place among the live streams.
-struct LivePermit {
+/// A place among the streams that are open.
+pub(crate) struct StreamPlace {
     _permit: OwnedSemaphorePermit,
 }
 
-impl LivePermit {
+impl StreamPlace {
     fn new(permit: OwnedSemaphorePermit) -> Self {
         metrics::gauge!(telemetry::SESSIONS_LIVE).increment(1.0);
         Self { _permit: permit }
     }
 }
 
-impl Drop for LivePermit {
+impl Drop for StreamPlace {
     fn drop(&mut self) {
         metrics::gauge!(telemetry::SESSIONS_LIVE).decrement(1.0);
     }
@@ -340,38 +391,35 @@ async fn attach(
     at.await.ok()
 }
 
-/// Publishes what the store knows of a session; one that cannot be read is reported and left as it is.
-///
-/// Gives the drive where it holds frames: they are not to be held for ever.
-async fn recover_one(surroundings: &Surroundings, record: &SessionRecord) -> Option<Loaded> {
-    let (session, journal) = (record.id, surroundings.journal.clone());
-    let state = if record.ended { SessionState::Closed } else { SessionState::Idle };
-    let loading = record.clone();
-    let read = blocking(move || {
-        let loaded = Loaded::read(&journal, loading)?;
-        let published = (!loaded.drive.is_hidden()).then(|| loaded.drive.published(session, state));
-        Ok((published, loaded.drive.holds_frames().then_some(loaded)))
-    });
-    match read.await {
-        Ok((published, holding)) => {
-            if let Some(published) = published {
-                surroundings.sessions.publish(published);
-            }
-            holding
-        }
+/// What is told of a session that sleeps: its summary, or that it has had no snapshot yet; nothing of one that is hidden.
+fn summary_of(record: &SessionRecord, bytes: Option<&[u8]>) -> Option<SessionSummary> {
+    let empty = SessionSummary::empty(record);
+    let Some(bytes) = bytes else { return (!record.cut.is_on()).then_some(empty) };
+    match postcard::from_bytes::<Option<SessionSummary>>(bytes) {
+        Ok(summary) => summary.map(|summary| SessionSummary { state: empty.state, ..summary }),
         Err(error) => {
-            tracing::error!(%session, %error, "the session cannot be served");
+            tracing::error!(session = %record.id, %error, "the session's summary does not decode");
             None
         }
     }
+}
+
+/// The map of a session that sleeps.
+fn read_published(journal: &Journal, session: SessionId) -> Result<Option<PublishedMap>, JournalError> {
+    let Some(record) = journal.record(session)? else { return Ok(None) };
+    let Loaded { record, drive, .. } = Loaded::read(journal, record)?;
+    Ok((!drive.is_hidden()).then(|| drive.published(session, state_without_stream(&record))))
 }
 
 pub(super) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-fn unreadable(session: SessionId, error: &JournalError) -> Error {
-    Error::Unreadable { session, reason: error.to_string() }
+fn unreadable(session: SessionId, error: JournalError) -> Error {
+    match error {
+        JournalError::Decode { .. } => Error::Unreadable { session, reason: error.to_string() },
+        _ => error.into(),
+    }
 }
 
 fn contradiction(record: &SessionRecord, start: &Start) -> Option<Refusal> {

@@ -57,6 +57,12 @@ impl RawStream {
         }
     }
 
+    /// Asks for a session that is not given; the status with which the stream ends.
+    pub async fn start_error(mut self, start: v1::SessionStart) -> Status {
+        self.send(Request::Start(start)).await;
+        self.end().await.unwrap_err()
+    }
+
     /// Sends a message.
     pub async fn send(&self, message: Request) {
         let message = v1::StreamObservationsRequest { message: Some(message) };

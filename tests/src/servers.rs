@@ -2,7 +2,7 @@
 
 use std::{
     io::{BufRead, BufReader},
-    path::Path,
+    path::{Path, PathBuf},
     process::{Child, Command, Stdio},
 };
 
@@ -40,11 +40,61 @@ impl ServerProcess {
     /// Starts `killable-server`, whose path is `binary`, on the store in `folder`, and waits until it listens.
     #[must_use]
     pub fn start(binary: &str, folder: &Path) -> Self {
-        let mut child = Command::new(binary).arg(folder).arg("127.0.0.1:0").stdout(Stdio::piped()).spawn().unwrap();
-        let mut url = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut url).unwrap();
-        assert!(url.starts_with("http://"), "the server says {url:?}");
-        Self { child, url: url.trim().to_owned() }
+        Self::spawn(Command::new(binary).arg(folder)).listening()
+    }
+
+    /// The same, on a disk of its own in memory that holds `disk_bytes`; what is on it goes with the process. `None` where
+    /// this machine lets no user mount one.
+    #[must_use]
+    pub fn start_on_small_disk(
+        binary: &str,
+        folder: &Path,
+        disk_bytes: u64,
+        settings: &[(&str, String)],
+    ) -> Option<Self> {
+        let mount = format!("mount -t tmpfs -o size={disk_bytes} tmpfs \"$1\"");
+        let unshare = || {
+            let mut command = Command::new("unshare");
+            command.args(["--user", "--map-root-user", "--mount", "sh", "-c"]);
+            command
+        };
+        let possible = unshare().args([&mount, "sh"]).arg(folder).stderr(Stdio::null()).status();
+        if !possible.is_ok_and(|status| status.success()) {
+            return None;
+        }
+        let serve = format!("{mount} && exec \"$0\" \"$@\"");
+        // What the command is given follows the program: the folder is both the disk's place and its first argument.
+        let settings = settings.iter().map(|(name, value)| (*name, value.as_str()));
+        Some(Self::spawn(unshare().arg(serve).arg(binary).arg(folder).envs(settings)).listening())
+    }
+
+    /// Starts a server and does not wait.
+    #[must_use]
+    pub fn spawn(command: &mut Command) -> Self {
+        let child = command.arg("127.0.0.1:0").stdout(Stdio::piped()).spawn().unwrap();
+        Self { child, url: String::new() }
+    }
+
+    /// Waits until it listens.
+    #[must_use]
+    pub fn listening(mut self) -> Self {
+        BufReader::new(self.child.stdout.take().unwrap()).read_line(&mut self.url).unwrap();
+        assert!(self.url.starts_with("http://"), "the server says {:?}", self.url);
+        self.url.truncate(self.url.trim_end().len());
+        self
+    }
+
+    /// Number of the process.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// A folder as the process sees it, e.g. on a disk that it alone has.
+    #[must_use]
+    pub fn path_within(&self, folder: &Path) -> PathBuf {
+        let root = PathBuf::from(format!("/proc/{}/root", self.id()));
+        root.join(folder.strip_prefix("/").unwrap())
     }
 
     /// `kill -9`.

@@ -153,7 +153,8 @@ fn line(input: &mut Input<'_>) -> Detection {
         .map(|k| {
             let x = f64::from(from) * 0.2 + f64::from(k) * f64::from(step) * 0.02;
             let wild = if k & 7 == 7 { f64::from(input.short()) * 1e-3 } else { 0.0 };
-            Point3::new(x, f64::from(lateral) * 0.1 + f64::from(bend) * 1e-4 * x * x + wild, wild * 0.1)
+            let y = f64::from(lateral) * 0.1 + f64::from(bend) * 1e-4 * x * x + wild;
+            Point3::new(x, y.clamp(-499.0, 499.0), wild * 0.1)
         })
         .collect();
     Detection { category, points_vehicle }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     category::Category,
     error::FrameError,
-    geometry::{Pose, TangentCovariance},
+    geometry::{Pose, TangentCovariance, pose::without_negative_zeros},
 };
 
 /// Number of a frame in its stream; strictly increasing within a session.
@@ -103,16 +103,19 @@ impl Default for FrameLimits {
 }
 
 impl Frame {
-    /// Validates the parts of a frame.
+    /// Validates the parts of a frame. A -0 in its pose or fix becomes 0: the wire does not tell them apart, and a frame
+    /// is to be the same to the last bit on both of its sides.
     ///
     /// # Errors
     /// The first field that is not finite, out of range, too long, or not a covariance; the error names it.
-    pub fn new(parts: FrameParts, limits: &FrameLimits) -> Result<Self, FrameError> {
+    pub fn new(mut parts: FrameParts, limits: &FrameLimits) -> Result<Self, FrameError> {
         check_odometry(&parts.odometry, limits)?;
         if let Some(fix) = &parts.gnss {
             check_gnss(fix)?;
         }
         check_detections(&parts.detections, limits)?;
+        parts.odometry.odometry_from_vehicle = without_negative_zeros(&parts.odometry.odometry_from_vehicle);
+        parts.gnss = parts.gnss.map(GnssFix::without_negative_zeros);
         Ok(Self { parts })
     }
 
@@ -144,6 +147,20 @@ impl Frame {
     #[must_use]
     pub fn detections(&self) -> &[Detection] {
         &self.parts.detections
+    }
+}
+
+impl GnssFix {
+    fn without_negative_zeros(self) -> Self {
+        Self {
+            latitude_deg: self.latitude_deg + 0.0,
+            longitude_deg: self.longitude_deg + 0.0,
+            height_m: self.height_m + 0.0,
+            // Not zero, or told apart by the wire.
+            horizontal_sigma_m: self.horizontal_sigma_m,
+            vertical_sigma_m: self.vertical_sigma_m,
+            yaw_enu_rad: self.yaw_enu_rad,
+        }
     }
 }
 
@@ -278,6 +295,15 @@ mod tests {
         let mut bad = parts();
         bad.detections[0].points_vehicle = vec![Point3::origin(); 5000];
         assert_eq!(refusal(bad), "detections[0].points has 5000 entries, limit 4096");
+    }
+
+    #[test]
+    fn a_negative_zero_of_a_pose_is_a_zero() {
+        let mut negative = parts();
+        negative.odometry.odometry_from_vehicle = Pose::translation(-0.0, 3.0, -0.0);
+        let frame = Frame::new(negative, &FrameLimits::default()).unwrap();
+        let place = frame.odometry().odometry_from_vehicle.translation;
+        assert!(place.x.is_sign_positive() && place.z.is_sign_positive(), "{place}");
     }
 
     #[test]

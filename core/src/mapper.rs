@@ -18,6 +18,7 @@ use crate::{
     geometry::{
         Pose, TangentCovariance,
         georeference::{Georeference, GeoreferenceFit},
+        pose::without_negative_zeros,
     },
     landmark::{
         Landmark, duplicate,
@@ -87,7 +88,9 @@ pub struct StepReport {
 impl Mapper {
     /// A mapper that knows nothing yet. Its map frame is the odometry frame of the drive at the first frame.
     #[must_use]
-    pub fn new(params: Params, sensor: Sensor) -> Self {
+    pub fn new(params: Params, mut sensor: Sensor) -> Self {
+        // As in a frame: the mapper is the same on both sides of the wire.
+        sensor.vehicle_from_sensor = without_negative_zeros(&sensor.vehicle_from_sensor);
         Self {
             params,
             sensor,

@@ -5,7 +5,9 @@
 //! Translation and rotation are perturbed separately, `exp(xi) = (xi_t, Exp(xi_r))`: for the small corrections of a
 //! mapper this differs from the full SE(3) exponential in second order only, and it keeps the Jacobians exact.
 
-use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{
+    Isometry3, Matrix3, Matrix4, Matrix6, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3, Vector6,
+};
 
 use crate::error::PoseError;
 
@@ -64,6 +66,15 @@ pub fn log(pose: &Pose) -> Vector6<f64> {
     let rotation = pose.rotation.scaled_axis();
     let translation = pose.translation.vector;
     Vector6::new(translation.x, translation.y, translation.z, rotation.x, rotation.y, rotation.z)
+}
+
+/// The same pose with every -0 as 0, which the wire does not tell apart.
+#[must_use]
+pub fn without_negative_zeros(target_from_source: &Pose) -> Pose {
+    let Pose { rotation, translation } = target_from_source;
+    // By IEEE 754, -0 + 0 is 0, and any other number stays as it is.
+    let rotation = UnitQuaternion::new_unchecked(Quaternion::from(rotation.coords.map(|value| value + 0.0)));
+    Pose::from_parts(Translation3::from(translation.vector.map(|value| value + 0.0)), rotation)
 }
 
 /// Heading of the source's x axis in the target frame, radians, counter-clockwise from the target's x axis.

@@ -200,7 +200,9 @@ mod tests {
     fn ask(query: &str) -> Page {
         let uri = format!("{PATH}?{query}").parse().unwrap();
         let sessions = Sessions::default();
-        three_sessions().into_iter().for_each(|map| sessions.publish(map));
+        for map in three_sessions() {
+            sessions.publish(map);
+        }
         let candidates = Candidates { summaries: sessions.list(), sessions, extents: Extents::default() };
         page(&candidates, &PageQuery::read(&uri).unwrap(), query)
     }

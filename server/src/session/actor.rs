@@ -139,7 +139,7 @@ struct Early {
 /// Frames admitted, not yet durable.
 #[derive(Default)]
 struct Batch {
-    frames: Vec<Box<Arrival>>,
+    frames: Vec<Arrival>,
     journal: Vec<JournalFrame>,
     repeated: bool,
     /// Frames that were cut: they are acked once it is durable how far the drive has come. Never beside other frames.
@@ -216,7 +216,7 @@ impl Actor {
                 tracing::error!(session = %self.record.id, %error, "the session ends");
             }
             // Not published: of what was admitted, some is not durable.
-            self.surroundings.sessions.fall_asleep(&self.record.id, state_without_stream(&self.record));
+            self.surroundings.sessions.fall_asleep(self.record.id, state_without_stream(&self.record));
             if let Some(stream) = self.stream.take() {
                 stream.outbox.finish(Err(error.into()));
             }
@@ -233,7 +233,7 @@ impl Actor {
         }
         self.save().await?;
         self.publish();
-        self.surroundings.sessions.fall_asleep(&self.record.id, state_without_stream(&self.record));
+        self.surroundings.sessions.fall_asleep(self.record.id, state_without_stream(&self.record));
         Ok(())
     }
 
@@ -448,7 +448,7 @@ impl Actor {
             Admission::Cut => batch.cut += 1,
             Admission::New => {
                 batch.journal.push(JournalFrame { sequence: arrival.frame.sequence(), bytes });
-                batch.frames.push(arrival);
+                batch.frames.push(*arrival);
             }
             Admission::Repeated => {
                 metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);

@@ -113,13 +113,14 @@ pub struct PublishedMap {
 impl PublishedMap {
     /// A map and its summary, whose number and extent of the lanes are filled in.
     #[must_use]
-    pub fn new(summary: SessionSummary, map: Arc<LaneMap>) -> Self {
+    pub fn new(mut summary: SessionSummary, map: Arc<LaneMap>) -> Self {
         let points = map.lanes.iter().flat_map(|lane| lane.control_points.iter().map(|point| point.position));
-        let extent = match &summary.georeference {
+        summary.extent = match &summary.georeference {
             Some(georeference) => extent(points.map(|point| georeference.enu_from_map * point)),
             None => extent(points),
         };
-        Self { summary: SessionSummary { lanes: map.lanes.len(), extent, ..summary }, map }
+        summary.lanes = map.lanes.len();
+        Self { summary, map }
     }
 }
 
@@ -212,14 +213,14 @@ impl Sessions {
     /// Whether there is a session of this name.
     #[must_use]
     pub fn contains(&self, session: &SessionId) -> bool {
-        self.entry(session).is_some()
+        self.entry(*session).is_some()
     }
 
     /// The newest map of one session. Reads the store where the session sleeps, which takes milliseconds: not for a task
     /// of the runtime.
     #[must_use]
     pub fn get(&self, session: &SessionId) -> Option<Arc<PublishedMap>> {
-        let entry = self.entry(session)?;
+        let entry = self.entry(*session)?;
         if let Some(awake) = entry.awake.load_full() {
             return Some(awake);
         }
@@ -266,13 +267,13 @@ impl Sessions {
     }
 
     /// Lets go of the map of a session that has fallen asleep, in this state.
-    pub(crate) fn fall_asleep(&self, session: &SessionId, state: SessionState) {
+    pub(crate) fn fall_asleep(&self, session: SessionId, state: SessionState) {
         let Some(entry) = self.entry(session) else { return };
         if let Some(awake) = entry.awake.swap(None) {
             let summary = SessionSummary { state, ..awake.summary.clone() };
             entry.summary.store(Arc::new(summary.clone()));
             let asleep = Arc::new(PublishedMap { summary, map: Arc::clone(&awake.map) });
-            self.shared.asleep.insert((*session, asleep.version), asleep);
+            self.shared.asleep.insert((session, asleep.version), asleep);
         }
     }
 
@@ -316,13 +317,13 @@ impl Sessions {
         self.shared.publications.send_modify(|count| *count += 1);
     }
 
-    fn entry(&self, session: &SessionId) -> Option<Arc<Entry>> {
+    fn entry(&self, session: SessionId) -> Option<Arc<Entry>> {
         let entries = self.shared.entries.read().unwrap_or_else(PoisonError::into_inner);
-        entries.get(session).map(Arc::clone)
+        entries.get(&session).map(Arc::clone)
     }
 
     fn entry_for(&self, summary: &SessionSummary) -> Arc<Entry> {
-        self.entry(&summary.session).unwrap_or_else(|| {
+        self.entry(summary.session).unwrap_or_else(|| {
             let mut entries = self.shared.entries.write().unwrap_or_else(PoisonError::into_inner);
             let fresh = || {
                 let summary = ArcSwap::from_pointee(summary.clone());
@@ -380,7 +381,7 @@ mod tests {
         });
         for id in &ids {
             sessions.publish(map(*id, 1));
-            sessions.fall_asleep(id, SessionState::Idle);
+            sessions.fall_asleep(*id, SessionState::Idle);
         }
         assert!(sessions.shared.asleep.weight() <= 5 * one);
         for id in &ids {

@@ -1,6 +1,10 @@
-//! A door for the fuzz targets of `tests/fuzz`, and for nobody else: the rules by which a session admits frames.
+//! A door for the fuzz targets of `tests/fuzz`, and for nobody else: the rules by which a session puts
+//! frames in order and admits them.
+
+use std::{ops::RangeInclusive, time::Duration};
 
 use lanemap_core::{Frame, Preset, Sensor, Sequence};
+use tokio::time::Instant;
 
 use crate::{
     journal::frame_bytes,
@@ -8,6 +12,7 @@ use crate::{
     session::{
         SessionSetup,
         drive::{Admission, Drive},
+        reorder::{Offer, Passed, Reorder},
     },
 };
 
@@ -84,4 +89,73 @@ impl FuzzedDrive {
 #[must_use]
 pub fn bytes_of(frame: &Frame) -> Vec<u8> {
     frame_bytes(frame).unwrap_or_default()
+}
+
+/// What passes a window of order.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ordered {
+    /// The next frame.
+    Frame(u64),
+    /// Numbers that did not come.
+    Gap(RangeInclusive<u64>),
+}
+
+/// A window of order as a session's actor holds it; a frame is its number, time is milliseconds from its making.
+#[derive(Debug)]
+pub struct FuzzedOrder {
+    reorder: Reorder<u64>,
+    began: Instant,
+}
+
+impl FuzzedOrder {
+    /// A window of `max_held` frames for `max_wait_ms`, after the frame `last`.
+    #[must_use]
+    pub fn new(max_held: usize, max_wait_ms: u64, last: Option<Sequence>) -> Self {
+        let max_wait = Duration::from_millis(max_wait_ms);
+        Self { reorder: Reorder::new(max_held, max_wait, last), began: Instant::now() }
+    }
+
+    /// Whether a number is of the past.
+    #[must_use]
+    pub fn has_passed(&self, sequence: Sequence) -> bool {
+        self.reorder.has_passed(sequence)
+    }
+
+    /// Offers a frame whose number has not passed; `false`: it is held already.
+    pub fn offer(&mut self, sequence: Sequence, at_ms: u64) -> bool {
+        let arrived = self.at(at_ms);
+        matches!(self.reorder.offer(sequence, sequence.0, arrived), Offer::Taken)
+    }
+
+    /// Takes note of a refused number.
+    pub fn refused(&mut self, sequence: Sequence) {
+        self.reorder.refused(sequence);
+    }
+
+    /// What passes next by then.
+    pub fn pass(&mut self, at_ms: u64) -> Option<Ordered> {
+        let now = self.at(at_ms);
+        self.reorder.pass(now).map(ordered)
+    }
+
+    /// What passes next where nothing more comes.
+    pub fn pass_last(&mut self) -> Option<Ordered> {
+        self.reorder.pass_last().map(ordered)
+    }
+
+    /// A new stream begins after `last`.
+    pub fn restart(&mut self, last: Option<Sequence>) {
+        self.reorder.restart(last);
+    }
+
+    fn at(&self, ms: u64) -> Instant {
+        self.began + Duration::from_millis(ms)
+    }
+}
+
+fn ordered(passed: Passed<u64>) -> Ordered {
+    match passed {
+        Passed::Frame(number) => Ordered::Frame(number),
+        Passed::Gap(numbers) => Ordered::Gap(numbers),
+    }
 }

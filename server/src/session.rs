@@ -12,7 +12,7 @@ mod mapping_turns;
 pub mod published;
 mod recent;
 pub(crate) mod registry;
-mod reorder;
+pub(crate) mod reorder;
 
 pub use crate::journal::{SessionKey, SessionRecord, SessionSetup};
 pub use id::SessionId;

@@ -53,6 +53,9 @@ fn main() {
     put("zenoh_keys", "seed-attachment", Attachment { nonce: StreamNonce(7), number: 9 }.to_string().as_bytes());
     put("zenoh_keys", "seed-id", "car 1/\u{e4}*".as_bytes());
 
+    put("order", "seed-in-order", &[4, 10].into_iter().chain([3, 1, 0].repeat(20)).collect::<Vec<u8>>());
+    put("order", "seed-late", &[3, 5, 3, 4, 0, 3, 2, 9, 1, 5, 3, 1, 0, 2, 3, 250, 1, 0, 3, 7, 7, 2].repeat(3));
+
     put("session", "seed-in-order", &[[3, 0, 0].as_slice(), &[0; 30]].concat().repeat(6));
     put("session", "seed-lines", &(0..240).map(|k: u8| k.wrapping_mul(37)).collect::<Vec<_>>());
     put("session", "seed-crashes", &[3, 0, 0, 1, 2, 0, 0, 3, 0, 1, 2, 1].repeat(12));

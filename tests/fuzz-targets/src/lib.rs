@@ -8,12 +8,14 @@
 
 mod frame;
 mod openlane;
+mod order;
 mod recordings;
 mod session;
 mod zenoh_keys;
 
 pub use frame::frame;
 pub use openlane::openlane;
+pub use order::order;
 pub use recordings::{bag, mcap, message_definition};
 pub use session::session;
 pub use zenoh_keys::zenoh_keys;
@@ -22,12 +24,13 @@ pub use zenoh_keys::zenoh_keys;
 pub type Target = fn(&[u8]);
 
 /// Every target by the name of its corpus.
-pub const TARGETS: [(&str, Target); 7] = [
+pub const TARGETS: [(&str, Target); 8] = [
     ("bag", bag),
     ("frame", frame),
     ("mcap", mcap),
     ("message_definition", message_definition),
     ("openlane", openlane),
+    ("order", order),
     ("session", session),
     ("zenoh_keys", zenoh_keys),
 ];

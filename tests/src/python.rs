@@ -95,10 +95,10 @@ impl Drop for PythonClient {
     }
 }
 
-/// The Python that has the package `lanemap`: that of `LANEMAP_PYTHON`, else that of the virtual environment which
+/// The Python that has the package `lanemap`: that of `PYTHON_WITH_LANEMAP`, else that of the virtual environment which
 /// `tests/run` makes in the target folder.
 fn interpreter() -> PathBuf {
-    if let Some(named) = env::var_os("LANEMAP_PYTHON") {
+    if let Some(named) = env::var_os("PYTHON_WITH_LANEMAP") {
         return named.into();
     }
     let test = env::current_exe().unwrap();
@@ -106,6 +106,6 @@ fn interpreter() -> PathBuf {
     let venv = target.map(|target| target.join("venv/bin/python")).filter(|python| python.exists());
     venv.expect(
         "no Python client: run `python3 -m venv target/venv && target/venv/bin/pip install ./clients/python`, \
-         or name a Python that has it in LANEMAP_PYTHON",
+         or name a Python that has it in PYTHON_WITH_LANEMAP",
     )
 }

@@ -77,7 +77,15 @@ async fn come_and_go(url: String, drives: Arc<[Drive]>, vehicle: usize) {
         let mut acked = None;
         loop {
             let client = IngestClient::connect(&url).await.unwrap();
-            let (mut session, _events) = client.start_session(start.clone()).await.unwrap();
+            let (mut session, _events) = match client.start_session(start.clone()).await {
+                Ok(started) => started,
+                Err(error) if error.is_transient() => {
+                    eprintln!("vehicle {vehicle} tries again: {error}");
+                    tokio::time::sleep(Duration::from_secs(1)).await;
+                    continue;
+                }
+                Err(error) => panic!("{error}"),
+            };
             assert!(session.resume_after() >= acked, "acked {acked:?}, kept {:?}", session.resume_after());
             let had = drive.frames.partition_point(|frame| Some(frame.sequence()) <= session.resume_after());
             let rest = &drive.frames[had..];

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use futures::{Stream, StreamExt};
 use lanemap_core::{FrameLimits, Sequence};
 use lanemap_proto::v1::{self, RefusalReason, stream_observations_request::Message};
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, sleep, timeout_at};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::Status;
 
@@ -87,9 +87,7 @@ impl Conversations {
             Ok(place) => place,
             Err(error) => return outbox.finish(Err(error.into())),
         };
-        let opened = timeout(self.config.start_wait(), self.open(&peer, &mut incoming)).await;
-        let too_late = || Err(Err(Error::NoStart { waited_s: self.config.start_wait_s }.into()));
-        let ending = match opened.unwrap_or_else(|_| too_late()) {
+        let ending = match self.open(&peer, &mut incoming).await {
             Ok(session) => {
                 outbox.accept(self.accepted(&session));
                 let ending = self.take_messages(&peer, &mut incoming, &session).await;
@@ -112,8 +110,12 @@ impl Conversations {
         M: Stream<Item = Result<v1::StreamObservationsRequest, Status>> + Unpin,
     {
         let outbox = incoming.outbox.clone();
+        // Only the vehicle is waited for so long, not what it asks for.
+        let deadline = Instant::now() + self.config.start_wait();
+        let too_late = || Error::NoStart { waited_s: self.config.start_wait_s };
         for _ in 0..MAX_REFUSALS_BEFORE_START {
-            let refusal = match incoming.next().await? {
+            let message = timeout_at(deadline, incoming.next()).await.map_err(|_| Err(too_late().into()))?;
+            let refusal = match message? {
                 Some(Message::Start(start)) => match self.start(peer, &start, &outbox).await {
                     Ok(session) => return Ok(session),
                     Err(OpenError::Refused(refusal)) => refusal,

@@ -1,19 +1,19 @@
 //! The actor of one session: the only owner of the drive's mapper.
 //!
-//! It gathers the frames that are waiting, puts them in order, makes them durable in one commit, acks them, maps them, and
-//! sends poses back.
-//! It publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
+//! It gathers the frames that are waiting, puts them in order (`intake`), makes them durable in one commit, acks them, maps
+//! them, and sends poses back. It publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
 //! snapshot every so many frames, when the drive ends, and before it leaves memory.
+
+mod command;
+mod intake;
+mod updates;
 
 use std::{sync::Arc, time::Duration};
 
-use lanemap_core::{Frame, LocalWindow, Sequence, StepReport};
-use lanemap_proto::{
-    encode,
-    v1::{self, RefusalReason, stream_observations_response::Message},
-};
+use lanemap_core::{Frame, Sequence};
+use lanemap_proto::v1::{self, stream_observations_response::Message};
 use tokio::{
-    sync::{mpsc, oneshot},
+    sync::mpsc,
     time::{Instant, sleep_until},
 };
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
@@ -21,75 +21,29 @@ use tonic::Status;
 
 use super::{
     SessionRecord, SessionState, Sessions,
-    drive::{Admission, Drive, DriveError, Loaded},
-    in_flight::{FramePlace, InFlightBudget},
+    drive::{Drive, DriveError, Loaded},
+    in_flight::InFlightBudget,
     mapping_turns::MappingTurns,
     published::state_without_stream,
     registry::{self, blocking},
-    reorder::{Offer, Passed, Reorder},
+    reorder::Reorder,
 };
 use crate::{
     config::ServerConfig,
     error::Error,
-    ingest::{Outbox, Refusal},
-    journal::{Journal, JournalError, JournalFrame, Snapshot, frame_bytes},
+    ingest::Outbox,
+    journal::{Journal, JournalError, JournalFrame, Snapshot},
     privacy::Pseudonyms,
     telemetry,
 };
+pub(crate) use command::{Arrival, Attach, Attached, Command, StreamNumber};
+use intake::Early;
+use updates::{local_map_update, pose_update};
 
 /// Time of mapping between two chances for other tasks to run.
 const LONGEST_RUN: Duration = Duration::from_millis(1);
 /// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
-
-/// Numbers the streams of one session, so that what a superseded stream still sends is told apart.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct StreamNumber(pub(crate) u64);
-
-/// What an actor is told.
-#[derive(Debug)]
-pub(crate) enum Command {
-    /// A stream of the vehicle opens; a stream before it is superseded.
-    Attach(Attach),
-    /// A validated frame.
-    Frame { stream: StreamNumber, arrival: Box<Arrival> },
-    /// A frame of this number was refused before it got here.
-    Refused { stream: StreamNumber, sequence: Sequence },
-    /// The drive is over.
-    End { stream: StreamNumber },
-    /// The stream closes; what it was promised is sent first, then `with`.
-    Detach { stream: StreamNumber, with: Result<(), Status> },
-    /// The drive is to be deleted: the actor leaves at once and saves nothing.
-    Forget,
-}
-
-/// A frame that came, and its place among those in flight.
-#[derive(Debug)]
-pub(crate) struct Arrival {
-    pub(crate) frame: Frame,
-    pub(crate) arrived: Instant,
-    /// Held until the frame is mapped.
-    #[expect(dead_code, reason = "held, not read")]
-    pub(crate) place: FramePlace,
-}
-
-/// A stream that opens.
-#[derive(Debug)]
-pub(crate) struct Attach {
-    pub(crate) stream: StreamNumber,
-    pub(crate) outbox: Outbox,
-    pub(crate) wants_local_map: bool,
-    /// Cancelled when the stream's task is gone, however it went.
-    pub(crate) gone: CancellationToken,
-    pub(crate) attached: oneshot::Sender<Attached>,
-}
-
-/// Where a session is when a stream opens.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Attached {
-    pub(crate) last: Option<Sequence>,
-    pub(crate) ended: bool,
-}
 
 /// What an actor shares with the rest of the service.
 #[derive(Clone, Debug)]
@@ -127,13 +81,6 @@ struct Stream {
     outbox: Outbox,
     wants_local_map: bool,
     gone: CancellationToken,
-}
-
-/// A frame that may have come too early, and the bytes under which it is journaled.
-#[derive(Debug)]
-struct Early {
-    arrival: Box<Arrival>,
-    bytes: Vec<u8>,
 }
 
 /// Frames admitted, not yet durable.
@@ -364,101 +311,6 @@ impl Actor {
         self.stream.as_ref().is_some_and(|stream| stream.outbox.is_closed())
     }
 
-    /// Takes a frame of the stream that is open: it passes, waits for those before it, or is refused.
-    async fn take_frame(&mut self, stream: StreamNumber, arrival: Box<Arrival>, batch: &mut Batch) -> Outcome {
-        if !self.is_current(stream) {
-            return Ok(());
-        }
-        let sequence = arrival.frame.sequence();
-        if self.record.ended {
-            let limit = "no frame after the end of the drive";
-            let refusal = Refusal::new(RefusalReason::OutOfTurn, "frame", "a frame", limit);
-            self.refuse(&refusal.of_frame(sequence)).await;
-            return Ok(());
-        }
-        let bytes = frame_bytes(&arrival.frame)?;
-        let early = Early { arrival, bytes };
-        if self.reorder.has_passed(sequence) {
-            return self.admit(early, batch).await;
-        }
-        let arrived = early.arrival.arrived;
-        match self.reorder.offer(sequence, early, arrived) {
-            Offer::Taken => self.pass_due(batch).await,
-            Offer::Held { before, again } if before.bytes == again.bytes => {
-                metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
-                Ok(())
-            }
-            Offer::Held { .. } => {
-                self.refuse(&given_twice(sequence)).await;
-                Ok(())
-            }
-        }
-    }
-
-    /// Admits what need not wait any more.
-    async fn pass_due(&mut self, batch: &mut Batch) -> Outcome {
-        let now = Instant::now();
-        while let Some(passed) = self.reorder.pass(now) {
-            self.take_passed(passed, batch).await?;
-        }
-        Ok(())
-    }
-
-    /// Admits what is held, since nothing more comes.
-    async fn pass_all(&mut self, batch: &mut Batch) -> Outcome {
-        while let Some(passed) = self.reorder.pass_last() {
-            self.take_passed(passed, batch).await?;
-        }
-        Ok(())
-    }
-
-    async fn take_passed(&mut self, passed: Passed<Early>, batch: &mut Batch) -> Outcome {
-        match passed {
-            Passed::Frame(early) => self.admit(early, batch).await,
-            Passed::Gap(missing) => {
-                if let Some(stream) = &self.stream {
-                    stream.outbox.gap(&missing).await;
-                }
-                Ok(())
-            }
-        }
-    }
-
-    /// Gives up frames that did not come in time.
-    async fn give_up_overdue(&mut self) -> Outcome {
-        let mut batch = Batch::default();
-        self.pass_due(&mut batch).await?;
-        self.commit(&mut batch).await?;
-        self.publish_if_due();
-        Ok(())
-    }
-
-    async fn refuse(&self, refusal: &Refusal) {
-        if let Some(stream) = &self.stream {
-            stream.outbox.refuse(refusal).await;
-        }
-    }
-
-    /// Puts a frame into the batch where it is next in its drive.
-    async fn admit(&mut self, Early { arrival, bytes }: Early, batch: &mut Batch) -> Outcome {
-        if batch.must_precede(self.drive.would_cut(&arrival.frame)) {
-            self.commit(batch).await?;
-        }
-        match self.drive.admit(&arrival.frame, &bytes) {
-            Admission::Cut => batch.cut += 1,
-            Admission::New => {
-                batch.journal.push(JournalFrame { sequence: arrival.frame.sequence(), bytes });
-                batch.frames.push(*arrival);
-            }
-            Admission::Repeated => {
-                metrics::counter!(telemetry::FRAMES_REPEATED).increment(1);
-                batch.repeated = true;
-            }
-            Admission::Refused(refusal) => self.refuse(&refusal).await,
-        }
-        Ok(())
-    }
-
     /// Makes the batch durable, acks it, maps it.
     async fn commit(&mut self, batch: &mut Batch) -> Outcome {
         let Batch { frames, journal, repeated, cut } = std::mem::take(batch);
@@ -616,34 +468,9 @@ async fn sleep_until_some(deadline: Option<Instant>) {
     }
 }
 
-fn given_twice(sequence: Sequence) -> Refusal {
-    let value = format!("{} again, with other content", sequence.0);
-    let limit = "the frame that waits under this number";
-    Refusal::new(RefusalReason::Sequence, "frame.sequence", value, limit).of_frame(sequence)
-}
-
 async fn cancelled(token: Option<CancellationToken>) {
     match token {
         Some(token) => token.cancelled().await,
         None => std::future::pending().await,
-    }
-}
-
-fn pose_update(report: &StepReport) -> v1::PoseUpdate {
-    v1::PoseUpdate {
-        sequence: report.sequence.0,
-        map_from_vehicle: Some(encode::pose(&report.map_from_vehicle)),
-        covariance: Some(encode::tangent_covariance(&report.covariance)),
-    }
-}
-
-fn local_map_update(report: &StepReport, drive: &Drive) -> v1::LocalMapUpdate {
-    let lanes = drive.mapper().local_map(&LocalWindow::default());
-    v1::LocalMapUpdate {
-        sequence: report.sequence.0,
-        lanes: lanes.iter().map(encode::local_lane).collect(),
-        born: report.born.iter().map(|born| born.lane.0).collect(),
-        grown: report.grown.iter().map(|lane| lane.0).collect(),
-        dropped: report.dropped.iter().map(|lane| lane.0).collect(),
     }
 }

@@ -2,6 +2,7 @@
 
 use lanemap_core::{
     Category, ControlPoint, Detection, EndRule, FieldOfView, Frame, GnssFix, LocalLane, MapLane, Odometry, Preset,
+    Sensor,
     geometry::{Pose, TangentCovariance, georeference::Georeference},
 };
 use nalgebra::Point3;
@@ -44,9 +45,18 @@ fn detection(detection: &Detection) -> v1::Detection {
     v1::Detection { category: category(detection.category).into(), xyz: points(&detection.points_vehicle) }
 }
 
-/// The bounds of an image.
+/// A sensor whose frames hold their points in the vehicle frame, as those of [`frame`] do.
 #[must_use]
-pub fn field_of_view(view: &FieldOfView) -> v1::FieldOfView {
+pub fn sensor(sensor: &Sensor) -> v1::Sensor {
+    v1::Sensor {
+        vehicle_from_sensor: Some(pose(&sensor.vehicle_from_sensor)),
+        axis_convention: v1::AxisConvention::Vehicle.into(),
+        field_of_view: sensor.field_of_view.as_ref().map(field_of_view),
+    }
+}
+
+/// The bounds of an image.
+fn field_of_view(view: &FieldOfView) -> v1::FieldOfView {
     v1::FieldOfView { tan_left: view.tan_left, tan_right: view.tan_right, tan_up: view.tan_up, tan_down: view.tan_down }
 }
 

@@ -45,11 +45,7 @@ impl Drive {
             vehicle_id: "vehicle-under-test".to_owned(),
             drive_id: self.name.clone(),
             preset: v1::MapperPreset::Default.into(),
-            sensor: Some(v1::Sensor {
-                vehicle_from_sensor: Some(encode::pose(&self.sensor.vehicle_from_sensor)),
-                axis_convention: v1::AxisConvention::Vehicle.into(),
-                field_of_view: self.sensor.field_of_view.as_ref().map(encode::field_of_view),
-            }),
+            sensor: Some(encode::sensor(&self.sensor)),
             wants_local_map: false,
         }
     }

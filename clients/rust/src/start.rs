@@ -55,12 +55,7 @@ impl SessionStart {
             vehicle_id: self.vehicle.clone(),
             drive_id: self.drive.clone(),
             preset: encode::preset(self.preset).into(),
-            sensor: Some(v1::Sensor {
-                vehicle_from_sensor: Some(encode::pose(&self.sensor.vehicle_from_sensor)),
-                // A `Frame` of lanemap-core holds its points in the vehicle frame.
-                axis_convention: v1::AxisConvention::Vehicle.into(),
-                field_of_view: self.sensor.field_of_view.as_ref().map(encode::field_of_view),
-            }),
+            sensor: Some(encode::sensor(&self.sensor)),
             wants_local_map: self.wants_local_map,
         }
     }

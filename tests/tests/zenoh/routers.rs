@@ -1,5 +1,7 @@
 //! Routers that are not the server itself, and endpoints that are not free.
 
+use std::path::Path;
+
 use lanemap_server::{
     Server, ServerConfig,
     config::ZenohMode,
@@ -13,17 +15,17 @@ use lanemap_tests::{
 
 use super::{IN_FLIGHT, config, start_of};
 
+/// Settings of a server that is a client of a router.
+fn client_of(endpoint: &str, folder: &Path) -> ServerConfig {
+    ServerConfig { zenoh_mode: ZenohMode::Client, zenoh_connect: endpoint.parse().unwrap(), ..servers::config(folder) }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_that_is_a_client_of_a_router_serves_the_same() {
     let folder = tempfile::tempdir().unwrap();
     let endpoint = free_endpoint();
     let router = zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[])).await.unwrap();
-    let settings = ServerConfig {
-        zenoh_mode: ZenohMode::Client,
-        zenoh_connect: endpoint.parse().unwrap(),
-        ..servers::config(folder.path())
-    };
-    let server = Server::start(settings).await.unwrap();
+    let server = Server::start(client_of(&endpoint, folder.path())).await.unwrap();
     let session = raw_zenoh::connect(&endpoint).await;
     raw_zenoh::server_is_there(&session, true).await;
     let drive = drives::simulated(5, 80);
@@ -48,12 +50,7 @@ async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
     let endpoint = free_endpoint();
     let start_router = || zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[]));
     let router = start_router().await.unwrap();
-    let settings = ServerConfig {
-        zenoh_mode: ZenohMode::Client,
-        zenoh_connect: endpoint.parse().unwrap(),
-        ..servers::config(folder.path())
-    };
-    let server = Server::start(settings).await.unwrap();
+    let server = Server::start(client_of(&endpoint, folder.path())).await.unwrap();
     let session = raw_zenoh::connect(&endpoint).await;
     raw_zenoh::server_is_there(&session, true).await;
     let drive = drives::simulated(5, 60);
@@ -78,11 +75,7 @@ async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
 async fn a_server_waits_for_its_router_a_while_and_then_says_which_it_was() {
     let folder = tempfile::tempdir().unwrap();
     let endpoint = free_endpoint();
-    let settings = ServerConfig {
-        zenoh_mode: ZenohMode::Client,
-        zenoh_connect: endpoint.parse().unwrap(),
-        ..servers::config(folder.path())
-    };
+    let settings = client_of(&endpoint, folder.path());
     let (server, router) = tokio::join!(
         Server::start(settings.clone()),
         zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[]))

@@ -99,11 +99,7 @@ impl Tape {
             vehicle_id: vehicle_id(vehicle),
             drive_id: format!("drive-{drive}"),
             preset: encode::preset(Preset::Default).into(),
-            sensor: Some(v1::Sensor {
-                vehicle_from_sensor: Some(encode::pose(&self.sensor.vehicle_from_sensor)),
-                axis_convention: v1::AxisConvention::Vehicle.into(),
-                field_of_view: self.sensor.field_of_view.as_ref().map(encode::field_of_view),
-            }),
+            sensor: Some(encode::sensor(&self.sensor)),
             wants_local_map: false,
         }))
     }

@@ -42,11 +42,7 @@ impl DriveStart {
             vehicle_id: self.vehicle.clone(),
             drive_id: self.drive.clone(),
             preset: encode::preset(self.preset).into(),
-            sensor: Some(v1::Sensor {
-                vehicle_from_sensor: Some(encode::pose(&self.sensor.vehicle_from_sensor)),
-                axis_convention: v1::AxisConvention::Vehicle.into(),
-                field_of_view: self.sensor.field_of_view.as_ref().map(encode::field_of_view),
-            }),
+            sensor: Some(encode::sensor(&self.sensor)),
             wants_local_map: false,
         }
     }

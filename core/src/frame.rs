@@ -1,5 +1,8 @@
 //! The input of the mapper: one frame of one vehicle, validated once and trusted afterwards.
 
+mod bytes;
+mod occlusion;
+
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +10,11 @@ use crate::{
     category::Category,
     error::FrameError,
     geometry::{Pose, TangentCovariance, pose::without_negative_zeros},
+    sensor::Sensor,
 };
+
+pub use bytes::FrameBytesError;
+pub use occlusion::{MAX_OCCLUSIONS, Occlusion};
 
 /// Number of a frame in its stream; strictly increasing within a session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -28,13 +35,13 @@ impl TimestampNs {
 /// One frame: where the vehicle believes it is, and the lanes that it sees.
 ///
 /// Made only by [`Frame::new`], so that a frame that exists is valid.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
     parts: FrameParts,
 }
 
 /// The fields of a [`Frame`] before validation.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct FrameParts {
     /// Number in the stream.
     pub sequence: Sequence,
@@ -46,6 +53,8 @@ pub struct FrameParts {
     pub gnss: Option<GnssFix>,
     /// Lane lines seen in this frame.
     pub detections: Vec<Detection>,
+    /// What is hidden behind other vehicles and the like, where the vehicle knows; none: it does not know.
+    pub occlusions: Vec<Occlusion>,
 }
 
 /// Odometry: a pose in a frame that is smooth but drifts.
@@ -103,7 +112,7 @@ impl Default for FrameLimits {
 }
 
 impl Frame {
-    /// Validates the parts of a frame. A -0 in its pose or fix becomes 0: the wire does not tell them apart, and a frame
+    /// Validates the parts of a frame. A -0 in its pose, fix or occlusions becomes 0: the wire does not tell them apart, and a frame
     /// is to be the same to the last bit on both of its sides.
     ///
     /// # Errors
@@ -114,8 +123,12 @@ impl Frame {
             check_gnss(fix)?;
         }
         check_detections(&parts.detections, limits)?;
+        occlusion::check(&parts.occlusions, limits)?;
         parts.odometry.odometry_from_vehicle = without_negative_zeros(&parts.odometry.odometry_from_vehicle);
         parts.gnss = parts.gnss.map(GnssFix::without_negative_zeros);
+        for occlusion in &mut parts.occlusions {
+            *occlusion = occlusion.without_negative_zeros();
+        }
         Ok(Self { parts })
     }
 
@@ -147,6 +160,18 @@ impl Frame {
     #[must_use]
     pub fn detections(&self) -> &[Detection] {
         &self.parts.detections
+    }
+
+    /// What is hidden behind other vehicles and the like; empty where the vehicle does not know.
+    #[must_use]
+    pub fn occlusions(&self) -> &[Occlusion] {
+        &self.parts.occlusions
+    }
+
+    /// Whether the vehicle knows that a point on the road (vehicle frame, metres) is hidden from its camera.
+    #[must_use]
+    pub fn hides(&self, point_vehicle: &Point3<f64>, sensor: &Sensor) -> bool {
+        self.parts.occlusions.iter().any(|occlusion| occlusion.hides(point_vehicle, sensor))
     }
 }
 
@@ -259,6 +284,7 @@ mod tests {
                 category: Category::WhiteSolid,
                 points_vehicle: vec![Point3::new(5.0, 1.0, 0.0)],
             }],
+            occlusions: Vec::new(),
         }
     }
 

@@ -32,6 +32,7 @@
 //!         odometry: Odometry { odometry_from_vehicle, motion_covariance: None },
 //!         gnss: None,
 //!         detections: vec![Detection { category: Category::WhiteSolid, points_vehicle: line }],
+//!         occlusions: Vec::new(),
 //!     };
 //!     mapper.step(&Frame::new(parts, &FrameLimits::default())?);
 //! }
@@ -58,7 +59,7 @@ pub mod tracking;
 
 pub use category::Category;
 pub use error::{FrameError, PoseError, SnapshotError};
-pub use frame::{Detection, Frame, FrameLimits, FrameParts, GnssFix, Odometry, Sequence, TimestampNs};
+pub use frame::{Detection, Frame, FrameLimits, FrameParts, GnssFix, Occlusion, Odometry, Sequence, TimestampNs};
 pub use geometry::{Pose, TangentCovariance};
 pub use lane_map::{ControlPoint, EndRule, LaneId, LaneMap, LocalLane, LocalWindow, MapLane};
 pub use mapper::{Mapper, StepReport};

@@ -1,8 +1,8 @@
 //! From the types of `lanemap-core` to the wire. Nothing is rounded: [`decode`](crate::decode) gives the same bits back.
 
 use lanemap_core::{
-    Category, ControlPoint, Detection, EndRule, FieldOfView, Frame, GnssFix, LocalLane, MapLane, Odometry, Preset,
-    Sensor,
+    Category, ControlPoint, Detection, EndRule, FieldOfView, Frame, GnssFix, LocalLane, MapLane, Occlusion, Odometry,
+    Preset, Sensor,
     geometry::{Pose, TangentCovariance, georeference::Georeference},
 };
 use nalgebra::Point3;
@@ -18,6 +18,7 @@ pub fn frame(frame: &Frame) -> v1::Frame {
         odometry: Some(odometry(frame.odometry())),
         gnss: frame.gnss().map(gnss_fix),
         detections: frame.detections().iter().map(detection).collect(),
+        occlusions: frame.occlusions().iter().map(occlusion).collect(),
     }
 }
 
@@ -43,6 +44,10 @@ fn gnss_fix(fix: &GnssFix) -> v1::GnssFix {
 
 fn detection(detection: &Detection) -> v1::Detection {
     v1::Detection { category: category(detection.category).into(), xyz: points(&detection.points_vehicle) }
+}
+
+fn occlusion(occlusion: &Occlusion) -> v1::Occlusion {
+    v1::Occlusion { from_rad: occlusion.from_rad, to_rad: occlusion.to_rad, range_m: occlusion.range_m }
 }
 
 /// A sensor whose frames hold their points in the vehicle frame, as those of [`frame`] do.

@@ -34,6 +34,7 @@ fn frame(sequence: u64) -> Frame {
         odometry,
         gnss: None,
         detections: (0..6).map(line).collect(),
+        occlusions: Vec::new(),
     };
     Frame::new(parts, &FrameLimits::default()).expect("a frame of plain numbers is valid")
 }

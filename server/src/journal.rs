@@ -123,7 +123,7 @@ pub struct JournalFrame {
 /// # Errors
 /// None in practice: a frame is plain numbers.
 pub fn frame_bytes(frame: &Frame) -> Result<Vec<u8>, JournalError> {
-    postcard::to_stdvec(frame).map_err(|error| decode_error("frame", &error))
+    frame.to_bytes().map_err(|error| decode_error("frame", &error))
 }
 
 /// A handle to the journal. Clones share it.
@@ -324,7 +324,7 @@ impl Journal {
     }
 }
 
-fn decode_error(what: &str, error: &postcard::Error) -> JournalError {
+fn decode_error(what: &str, error: &dyn std::error::Error) -> JournalError {
     JournalError::Decode { what: what.to_owned(), reason: error.to_string() }
 }
 
@@ -338,7 +338,14 @@ mod tests {
     fn frame(sequence: u64) -> Frame {
         let odometry = Odometry { odometry_from_vehicle: Pose::identity(), motion_covariance: None };
         let time = TimestampNs(i64::try_from(sequence).unwrap());
-        let parts = FrameParts { sequence: Sequence(sequence), time, odometry, gnss: None, detections: vec![] };
+        let parts = FrameParts {
+            sequence: Sequence(sequence),
+            time,
+            odometry,
+            gnss: None,
+            detections: vec![],
+            occlusions: vec![],
+        };
         Frame::new(parts, &FrameLimits::default()).unwrap()
     }
 

@@ -75,6 +75,7 @@ fn six_lane_drive(camera: &Camera) -> Vec<Frame> {
                 odometry: Odometry { odometry_from_vehicle, motion_covariance: Some(noise.motion_covariance()) },
                 gnss: None,
                 detections: detector.observe(&views(pose, along_m(frame)), 0.1),
+                occlusions: Vec::new(),
             };
             Frame::new(parts, &FrameLimits::default()).expect("the simulator's frames are valid")
         })

@@ -145,6 +145,7 @@ fn frame(sequence: u64, with_gnss: bool) -> v1::Frame {
             yaw_enu_rad: Some(std::f64::consts::FRAC_PI_2),
         }),
         detections: vec![line(v1::LaneCategory::WhiteDashed, SIDE_M), line(v1::LaneCategory::WhiteSolid, -SIDE_M)],
+        occlusions: vec![],
     }
 }
 

@@ -370,6 +370,7 @@ fn with_fixes(drive: &Drive) -> Drive {
             odometry: frame.odometry().clone(),
             gnss,
             detections: frame.detections().to_vec(),
+            occlusions: frame.occlusions().to_vec(),
         };
         Frame::new(parts, &FrameLimits::default()).unwrap()
     });

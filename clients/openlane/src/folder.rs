@@ -214,6 +214,7 @@ impl DriveFrame {
             odometry: Odometry { odometry_from_vehicle, motion_covariance },
             gnss: None,
             detections: self.detections_vehicle(),
+            occlusions: Vec::new(),
         }
     }
 }

@@ -34,6 +34,14 @@ class Values(unittest.TestCase):
         self.assertEqual(message.odometry.motion_covariance.upper_triangle[6], 2.0)
         self.assertEqual(message.gnss.position.latitude_deg, 48.1)
 
+    def test_what_is_hidden_is_what_the_wire_has_and_nothing_unless_said(self):
+        hidden = frame(occlusions=[lanemap.Occlusion(-0.1, 0.2, 15)]).occlusions
+        self.assertEqual([(part.from_rad, part.to_rad, part.range_m) for part in hidden], [(-0.1, 0.2, 15.0)])
+        self.assertEqual(len(frame().occlusions), 0)
+        self.assertRefused("occlusions[0].to_rad is 0", "1 to 7.28", occlusions=[lanemap.Occlusion(1, 0, 15)])
+        self.assertRefused("occlusions[1].range_m is nan", occlusions=[lanemap.Occlusion(0, 1, 15), lanemap.Occlusion(0, 1, float("nan"))])
+        self.assertRefused("occlusions has 65 entries", "64", occlusions=[lanemap.Occlusion(0, 1, 15)] * 65)
+
     def test_bad_numbers_are_named_with_value_and_limit(self):
         self.assertRefused("detections[0].points[1, 1] is nan", "finite", detections=[[[0, 0, 0], [1, float("nan"), 0]]])
         self.assertRefused("detections[1].points[0, 0] is 501.0", "500.0 m", detections=[LINE, [[501, 0, 0], [1, 0, 0]]])

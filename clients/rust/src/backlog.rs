@@ -32,6 +32,7 @@ pub(crate) enum Leaving {
 
 /// What is to be sent next.
 #[derive(Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "a frame in passing: a box would cost more than it saves")]
 pub(crate) enum Next {
     Frame(v1::Frame),
     Leave(Leaving),
@@ -78,6 +79,7 @@ enum Store {
 }
 
 /// What became of a frame that was pushed.
+#[expect(clippy::large_enum_variant, reason = "a frame in passing: a box would cost more than it saves")]
 enum Pushed {
     Taken,
     /// The frame comes back; a spool says how full it is.

@@ -173,6 +173,7 @@ impl SimulatedFrame {
             },
             gnss: world_on_earth.map(|world| world.fix_at(&self.gnss_world_from_vehicle, GNSS_SIGMA_M, GNSS_SIGMA_M)),
             detections: self.detections.clone(),
+            occlusions: Vec::new(),
         }
     }
 }

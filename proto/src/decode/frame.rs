@@ -3,7 +3,10 @@
 //! Points come in the session's axis convention and leave in the vehicle frame. Counts are checked before anything is
 //! copied, so that a message of a million points costs no more than its own bytes.
 
-use lanemap_core::{Detection, Frame, FrameLimits, FrameParts, GnssFix, Odometry, Sequence, TimestampNs};
+use lanemap_core::{
+    Detection, Frame, FrameLimits, FrameParts, GnssFix, Occlusion, Odometry, Sequence, TimestampNs,
+    frame::MAX_OCCLUSIONS,
+};
 
 use super::{DecodeError, PointFrame, category, points, pose, required, tangent_covariance};
 use crate::v1;
@@ -23,6 +26,7 @@ pub fn frame(message: &v1::Frame, frame: &PointFrame, limits: &FrameLimits) -> R
 fn frame_parts(message: &v1::Frame, frame: &PointFrame, limits: &FrameLimits) -> Result<FrameParts, DecodeError> {
     let count = message.detections.len();
     at_most(count, limits.max_detections, || "frame.detections".to_owned())?;
+    at_most(message.occlusions.len(), MAX_OCCLUSIONS, || "frame.occlusions".to_owned())?;
     let wire_odometry = required(message.odometry.as_ref(), || "frame.odometry".to_owned())?;
     let detections = message.detections.iter().enumerate();
     Ok(FrameParts {
@@ -33,7 +37,12 @@ fn frame_parts(message: &v1::Frame, frame: &PointFrame, limits: &FrameLimits) ->
         detections: detections
             .map(|(index, message)| detection(message, index, frame, limits))
             .collect::<Result<_, _>>()?,
+        occlusions: message.occlusions.iter().map(occlusion).collect(),
     })
+}
+
+fn occlusion(message: &v1::Occlusion) -> Occlusion {
+    Occlusion { from_rad: message.from_rad, to_rad: message.to_rad, range_m: message.range_m }
 }
 
 fn odometry(message: &v1::Odometry) -> Result<Odometry, DecodeError> {

@@ -86,7 +86,7 @@ pub fn frame(message: &v1::Frame, points: &PointFrame, limits: &FrameLimits) -> 
 #[cfg(test)]
 mod tests {
     use lanemap_core::{
-        Category, Detection, FrameParts, GnssFix, Odometry, TimestampNs,
+        Category, Detection, FrameParts, GnssFix, Occlusion, Odometry, TimestampNs,
         geometry::{Pose, TangentCovariance},
     };
     use lanemap_proto::encode;
@@ -134,12 +134,15 @@ mod tests {
         });
         let variances = prop::option::of(prop::array::uniform6(0.0..1.0f64));
         let detections = prop::collection::vec(detection, 0..5);
-        (any::<u64>(), any::<i64>(), pose, variances, prop::option::of(fix), detections).prop_map(
-            |(sequence, time, odometry_from_vehicle, variances, gnss, detections)| {
+        let occlusion = (-3.1..3.1f64, 0.0..6.0f64, 0.0..500.0f64)
+            .prop_map(|(from_rad, width_rad, range_m)| Occlusion { from_rad, to_rad: from_rad + width_rad, range_m });
+        let occlusions = prop::collection::vec(occlusion, 0..4);
+        (any::<u64>(), any::<i64>(), pose, variances, prop::option::of(fix), detections, occlusions).prop_map(
+            |(sequence, time, odometry_from_vehicle, variances, gnss, detections, occlusions)| {
                 let motion_covariance = variances.map(|v| TangentCovariance::from_diagonal(&v.into()));
                 let odometry = Odometry { odometry_from_vehicle, motion_covariance };
                 let (sequence, time) = (Sequence(sequence), TimestampNs(time));
-                let parts = FrameParts { sequence, time, odometry, gnss, detections };
+                let parts = FrameParts { sequence, time, odometry, gnss, detections, occlusions };
                 Frame::new(parts, &FrameLimits::default()).unwrap()
             },
         )
@@ -151,7 +154,9 @@ mod tests {
             let bytes = encode::frame(&frame).encode_to_vec();
             let message = v1::Frame::decode(bytes.as_slice()).unwrap();
             let decoded = super::frame(&message, &PointFrame::Vehicle, &FrameLimits::default()).unwrap();
-            prop_assert_eq!(frame_bytes(&decoded).unwrap(), frame_bytes(&frame).unwrap());
+            let kept = frame_bytes(&frame).unwrap();
+            prop_assert_eq!(&frame_bytes(&decoded).unwrap(), &kept);
+            prop_assert_eq!(Frame::from_bytes(&kept).unwrap(), frame);
         }
 
         #[test]
@@ -177,6 +182,19 @@ mod tests {
         assert!(refusal(huge).starts_with(&format!("{field}[1].z is 1000000")));
         let torn = "frame 7: frame.detections[0].xyz is 7 entries, limit: a multiple of 3";
         assert_eq!(refusal(vec![1.0; 7]), torn);
+    }
+
+    #[test]
+    fn a_bad_occlusion_is_refused_by_field_value_and_limit() {
+        let hidden = |from_rad, to_rad, range_m| {
+            let occlusions = vec![v1::Occlusion { from_rad, to_rad, range_m }];
+            let message = v1::Frame { occlusions, ..message(vec![1.0; 6]) };
+            frame(&message, &PointFrame::Vehicle, &FrameLimits::default()).unwrap_err().to_string()
+        };
+        let field = "frame 7: frame.occlusions[0]";
+        assert_eq!(hidden(0.0, f64::NAN, 9.0), format!("{field}.to_rad is NaN, limit: finite"));
+        assert_eq!(hidden(0.0, 1.0, 501.0), format!("{field}.range_m is 501, limit: 0 ..= 500"));
+        assert!(hidden(4.0, 5.0, 9.0).starts_with(&format!("{field}.from_rad is 4, limit: -3.14")));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! | keyspace    | key                                          | value                       |
 //! |-------------|----------------------------------------------|-----------------------------|
 //! | `records`   | id, 8 bytes big-endian                       | record, postcard            |
-//! | `frames`    | id, then sequence, 8 bytes big-endian each   | frame, postcard             |
+//! | `frames`    | id, then sequence, 8 bytes big-endian each   | `Frame::to_bytes`           |
 //! | `snapshots` | id                                           | the session's own bytes     |
 //! | `cuts`      | id                                           | how far the drive has come where its frames are cut |
 //! | `summaries` | id                                           | the session's own bytes     |
@@ -245,7 +245,7 @@ impl Reopenable {
             let _held = &store;
             let value = entry.value()?;
             let what = || format!("a frame of session {session}");
-            postcard::from_bytes(&value).map_err(|error| decode_error(&what(), &error))
+            Frame::from_bytes(&value).map_err(|error| decode_error(&what(), &error))
         }))
     }
 }

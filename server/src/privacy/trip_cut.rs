@@ -189,7 +189,14 @@ mod tests {
         let pose = Pose::translation(x_m, 0.0, 0.0);
         let odometry = Odometry { odometry_from_vehicle: pose, motion_covariance: None };
         let time = TimestampNs(i64::try_from(number).unwrap() * 100_000_000);
-        let parts = FrameParts { sequence: Sequence(number), time, odometry, gnss: None, detections: vec![] };
+        let parts = FrameParts {
+            sequence: Sequence(number),
+            time,
+            odometry,
+            gnss: None,
+            detections: vec![],
+            occlusions: vec![],
+        };
         Frame::new(parts, &FrameLimits::default()).unwrap()
     }
 

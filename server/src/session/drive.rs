@@ -317,7 +317,7 @@ mod tests {
     fn frame(sequence: u64, time_ns: i64) -> (Frame, Vec<u8>) {
         let odometry = Odometry { odometry_from_vehicle: Pose::identity(), motion_covariance: None };
         let (sequence, time) = (Sequence(sequence), TimestampNs(time_ns));
-        let parts = FrameParts { sequence, time, odometry, gnss: None, detections: vec![] };
+        let parts = FrameParts { sequence, time, odometry, gnss: None, detections: vec![], occlusions: vec![] };
         let frame = Frame::new(parts, &FrameLimits::default()).unwrap();
         let bytes = frame_bytes(&frame).unwrap();
         (frame, bytes)

@@ -14,7 +14,7 @@ use crate::config::ServerConfig;
 const UNIT_BYTES: usize = 1024;
 /// Sessions that it takes to use up all bytes.
 const SHARES: usize = 16;
-/// Bytes that a frame takes besides its points.
+/// Bytes that a frame takes besides its points and occlusions.
 const FRAME_BYTES: usize = 512;
 
 /// The bytes that all sessions share. Clones share them.
@@ -84,7 +84,7 @@ impl SessionInFlight {
 fn frame_bytes_in_memory(frame: &Frame) -> usize {
     let points: usize = frame.detections().iter().map(|detection| detection.points_vehicle.len()).sum();
     // The frame, and the bytes that go into the journal.
-    FRAME_BYTES + 2 * points * size_of::<[f64; 3]>()
+    FRAME_BYTES + 2 * (points + frame.occlusions().len()) * size_of::<[f64; 3]>()
 }
 
 #[cfg(test)]
@@ -100,7 +100,14 @@ mod tests {
         let line =
             Detection { category: Category::WhiteSolid, points_vehicle: vec![Point3::new(1.0, 0.0, 0.0); points] };
         let detections = vec![line];
-        let parts = FrameParts { sequence: Sequence(1), time: TimestampNs(1), odometry, gnss: None, detections };
+        let parts = FrameParts {
+            sequence: Sequence(1),
+            time: TimestampNs(1),
+            odometry,
+            gnss: None,
+            detections,
+            occlusions: vec![],
+        };
         Frame::new(parts, &FrameLimits::default()).unwrap()
     }
 

@@ -140,7 +140,7 @@ fn frame(input: &mut Input<'_>, (last, last_ns): (u64, i64)) -> Frame {
     let detections = (0..lines).map(|_| line(input)).collect();
     let odometry = Odometry { odometry_from_vehicle, motion_covariance: None };
     let (sequence, time) = (Sequence(sequence), TimestampNs(time));
-    let parts = FrameParts { sequence, time, odometry, gnss: None, detections };
+    let parts = FrameParts { sequence, time, odometry, gnss: None, detections, occlusions: Vec::new() };
     Frame::new(parts, &FrameLimits::default()).expect("its numbers are within the limits")
 }
 

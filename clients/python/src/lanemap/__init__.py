@@ -13,7 +13,7 @@ from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials
 from ._session import Reconnect, Session
 from ._spool import SpoolOptions, SpoolRecovery
-from ._values import Category, Detection, FieldOfView, GnssFix, Limits, Pose, Sensor
+from ._values import Category, Detection, FieldOfView, GnssFix, Limits, Occlusion, Pose, Sensor
 from .errors import LanemapError, Refused, SessionError, SpoolError, SpoolFull
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "LanemapError",
     "Limits",
     "LocalMap",
+    "Occlusion",
     "Pose",
     "Reconnect",
     "Refusal",

@@ -17,7 +17,7 @@ from ._backlog import Backlog, Leaving
 from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials, Link, Stream, link_to
 from ._spool import Spool, SpoolOptions, SpoolRecovery
-from ._values import Detection, GnssFix, Limits, Pose, Preset, Sensor
+from ._values import Detection, GnssFix, Limits, Occlusion, Pose, Preset, Sensor
 from .errors import LanemapError, Refused, SessionError, SpoolError, StreamBroken
 from .v1 import ingest_service_pb2 as ingest
 
@@ -112,20 +112,22 @@ class Session:
         *,
         gnss: GnssFix | None = None,
         motion_covariance: npt.ArrayLike | None = None,
+        occlusions: Iterable[Occlusion] = (),
         sequence: int | None = None,
         timeout_s: float | None = None,
     ) -> int:
         """Takes a frame; gives its number, which is one more than the last where `sequence` does not say.
 
         `time_ns` is the time of measurement since the Unix epoch, `pose` is odometry_from_vehicle (a `Pose` or a 4x4
-        matrix), each detection a `Detection` or an (n, 3) array. Raises `ValueError` for what the service would refuse,
+        matrix), each detection a `Detection` or an (n, 3) array, `occlusions` what other
+        vehicles hide, where an object detector knows. Raises `ValueError` for what the service would refuse,
         `SpoolFull` where the spool is full and told to refuse, `TimeoutError` where no room came in time (the frame is
         not taken in each of these, and the session goes on), and `SessionError` where the session has failed.
         """
         with self._changed:
             self._raise_if_failed()
             number = self._next_sequence if sequence is None else sequence
-        message = _values.frame(number, time_ns, pose, detections, gnss, motion_covariance, self._limits)
+        message = _values.frame(number, time_ns, pose, detections, gnss, motion_covariance, self._limits, occlusions)
         if number < self._next_sequence:
             raise ValueError(f"sequence is {number}, limit: above {self._next_sequence - 1}, the last one taken")
         if self._last_time_ns is not None and time_ns <= self._last_time_ns:

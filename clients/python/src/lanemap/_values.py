@@ -21,6 +21,7 @@ MAX_ID_CHARS = 128
 MAX_MOUNT_M = 100.0
 MAX_ODOMETRY_M = 1e7
 MAX_VARIANCE = 1e4
+MAX_OCCLUSIONS = 64
 ROTATION_NORM_TOLERANCE = 1e-3
 MIN_POINTS = 2
 
@@ -231,6 +232,23 @@ class GnssFix:
         )
 
 
+@dataclass(frozen=True)
+class Occlusion:
+    """What another vehicle hides from the camera: between two bearings (radians counter-clockwise from the vehicle's x
+    axis, right border first, seen from below the camera) nothing on the road is visible beyond a range, metres."""
+
+    from_rad: float
+    to_rad: float
+    range_m: float
+
+    def to_message(self, name: str, limits: Limits) -> observation_pb2.Occlusion:
+        """As the wire has it."""
+        _within(self.from_rad, -math.pi, math.pi, f"{name}.from_rad")
+        _within(self.to_rad, self.from_rad, self.from_rad + 2 * math.pi, f"{name}.to_rad")
+        _within(self.range_m, 0, limits.max_point_range_m, f"{name}.range_m")
+        return observation_pb2.Occlusion(from_rad=self.from_rad, to_rad=self.to_rad, range_m=self.range_m)
+
+
 def frame(
     sequence: int,
     time_ns: int,
@@ -239,6 +257,7 @@ def frame(
     gnss: GnssFix | None,
     motion_covariance: npt.ArrayLike | None,
     limits: Limits,
+    occlusions: Iterable[Occlusion] = (),
 ) -> observation_pb2.Frame:
     """A frame as the wire has it."""
     _whole(sequence, 0, 2**64 - 1, "sequence")
@@ -256,6 +275,11 @@ def frame(
     for index, line in enumerate(lines):
         line = line if isinstance(line, Detection) else Detection(line)
         message.detections.append(line.to_message(f"detections[{index}]", limits))
+    hidden = list(occlusions)
+    if len(hidden) > MAX_OCCLUSIONS:
+        raise ValueError(f"occlusions has {len(hidden)} entries, limit: {MAX_OCCLUSIONS}")
+    for index, occlusion in enumerate(hidden):
+        message.occlusions.append(occlusion.to_message(f"occlusions[{index}]", limits))
     if message.ByteSize() > limits.max_message_bytes - 16:
         raise ValueError(f"the frame has {message.ByteSize()} bytes, limit: messages of {limits.max_message_bytes} bytes")
     return message
@@ -358,4 +382,4 @@ def _quaternion(rotation: Array) -> tuple[float, float, float, float]:
     return float(x), float(y), float(z), float(w)
 
 
-__all__ = ["Axes", "Category", "Detection", "FieldOfView", "GnssFix", "Limits", "Pose", "Preset", "Sensor"]
+__all__ = ["Axes", "Category", "Detection", "FieldOfView", "GnssFix", "Limits", "Occlusion", "Pose", "Preset", "Sensor"]

@@ -154,6 +154,7 @@ fn frame<R: Read + Seek>(
         odometry: Odometry { odometry_from_vehicle, motion_covariance: None },
         gnss: None,
         detections,
+        occlusions: Vec::new(),
     })
 }
 

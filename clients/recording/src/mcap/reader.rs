@@ -131,6 +131,7 @@ fn frame(bytes: &[u8], points: &PointFrame) -> Result<FrameParts, String> {
         odometry: Odometry::clone(frame.odometry()),
         gnss: frame.gnss().copied(),
         detections: frame.detections().to_vec(),
+        occlusions: frame.occlusions().to_vec(),
     })
 }
 

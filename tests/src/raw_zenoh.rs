@@ -1,7 +1,6 @@
 //! A vehicle in zenoh that puts exactly what a test wants put, however wrong.
 
 use std::{
-    net::{Ipv4Addr, TcpListener},
     sync::atomic::{AtomicU64, Ordering},
     time::Duration,
 };
@@ -24,13 +23,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 /// Longest wait for an answer before a test fails; an answer takes milliseconds.
 const PATIENCE: Duration = Duration::from_secs(20);
-
-/// An endpoint on this machine whose port was free a moment ago.
-#[must_use]
-pub fn free_endpoint() -> String {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    format!("tcp/{}", listener.local_addr().unwrap())
-}
+/// Longest wait for an answer where a link may break; its vehicle begins anew then.
+const BREAK: Duration = Duration::from_secs(2);
 
 /// A configuration of zenoh that looks for nobody.
 #[must_use]
@@ -215,6 +209,64 @@ impl RawZenohStream {
                 self.send_frame(lanemap_proto::encode::frame(frame)).await;
             }
             self.acked(window.last().unwrap().sequence().0).await;
+        }
+    }
+
+    /// Streams frames to the last ack, as a vehicle does whose link may break: what is not acked is sent again on a new
+    /// stream. Zenoh's links over TLS break by themselves now and then, see `lanemap_server`'s `link_security`.
+    pub async fn streamed_whatever_breaks(
+        session: &Session,
+        start: &v1::SessionStart,
+        frames: &[lanemap_core::Frame],
+        in_flight: usize,
+    ) -> Self {
+        let streamed = async {
+            loop {
+                let mut stream = Self::open(session, &start.fleet_id, &start.vehicle_id).await;
+                if stream.streams_on(start, frames, in_flight).await.is_some() {
+                    return stream;
+                }
+            }
+        };
+        timeout(2 * PATIENCE, streamed).await.expect("every stream breaks")
+    }
+
+    /// Starts the session and streams the frames that it has not had; `None` where the stream breaks.
+    async fn streams_on(
+        &mut self,
+        start: &v1::SessionStart,
+        frames: &[lanemap_core::Frame],
+        in_flight: usize,
+    ) -> Option<()> {
+        self.send(Request::Start(start.clone())).await;
+        let Response::Accepted(accepted) = self.answer_unless_broken().await? else { return None };
+        let had = accepted.resume_after_sequence.unwrap_or(0);
+        let first = frames.partition_point(|frame| frame.sequence().0 <= had);
+        for window in frames[first..].chunks(in_flight) {
+            for frame in window {
+                self.send_frame(lanemap_proto::encode::frame(frame)).await;
+            }
+            let last = window.last()?.sequence().0;
+            loop {
+                match self.answer_unless_broken().await? {
+                    Response::Ack(ack) if ack.acked_sequence_inclusive >= last => break,
+                    Response::Closed(_) => return None,
+                    _ => {}
+                }
+            }
+        }
+        Some(())
+    }
+
+    /// The next answer of this stream; `None` where none comes or one is missing.
+    async fn answer_unless_broken(&mut self) -> Option<Response> {
+        loop {
+            let (attachment, answer) = answer_of(&timeout(BREAK, self.acks.recv_async()).await.ok()?.ok()?);
+            if attachment.nonce == self.nonce {
+                let in_turn = attachment.number == self.next_ack;
+                self.next_ack += 1;
+                return in_turn.then_some(answer);
+            }
         }
     }
 

@@ -19,9 +19,9 @@ use lanemap_server::{RunningServer, Server, ServerConfig, config::ZenohMode};
 use lanemap_tests::{
     authorities::TlsFolder,
     drives::{self, Drive, assert_same_map},
+    endpoints::HeldEndpoint,
     proxy::{Fault, Proxy},
     python::{self, PythonClient, PythonRun},
-    raw_zenoh::free_endpoint,
     servers,
     tokens::{self, TokenIssuer},
 };
@@ -42,7 +42,7 @@ const FAULTS: [Fault; 6] =
 /// A server that is a zenoh router too, and a folder of its own.
 struct Service {
     server: RunningServer,
-    zenoh: String,
+    zenoh: HeldEndpoint,
     folder: TempDir,
     tls: Option<VehicleTls>,
 }
@@ -106,18 +106,18 @@ impl Service {
     async fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let config = servers::config(&folder.path().join("data"));
-        Self::start_with(config, free_endpoint(), folder, None).await
+        Self::start_with(config, HeldEndpoint::tcp(), folder, None).await
     }
 
     /// With TLS and client certificates, and nothing without.
     async fn start_secured() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let tls = VehicleTls::new(folder.path());
-        let zenoh = free_endpoint().replace("tcp/", "tls/");
+        let zenoh = HeldEndpoint::tls();
         Self::start_with(tls.config(), zenoh, folder, Some(tls)).await
     }
 
-    async fn start_with(config: ServerConfig, zenoh: String, folder: TempDir, tls: Option<VehicleTls>) -> Self {
+    async fn start_with(config: ServerConfig, zenoh: HeldEndpoint, folder: TempDir, tls: Option<VehicleTls>) -> Self {
         let config = ServerConfig { zenoh_mode: ZenohMode::Router, zenoh_listen: zenoh.parse().unwrap(), ..config };
         Self { server: Server::start(config).await.unwrap(), zenoh, folder, tls }
     }

@@ -30,6 +30,7 @@ use lanemap_server::{
 };
 use lanemap_tests::{
     drives::{self, Drive, assert_same_map},
+    endpoints::HeldEndpoint,
     http,
     raw_stream::RawStream,
     raw_zenoh::{self, RawZenohStream},
@@ -285,7 +286,7 @@ async fn no_answer_metric_log_line_or_file_of_the_store_names_a_vehicle_its_flee
     const DRIVE: &str = "drive-h5v1t6";
     const DRIVE_OVER_ZENOH: &str = "drive-n2b8y4";
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = raw_zenoh::free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = LoggingServer::start(folder.path(), &["--zenoh-mode", "router", "--zenoh-listen", &endpoint]);
     let url = server.url.clone();
     let drive = drives::simulated(5, 30);
@@ -451,7 +452,7 @@ async fn a_cut_drive_that_kills_interrupt_anywhere_gives_the_same_map_and_its_en
 #[tokio::test(flavor = "multi_thread")]
 async fn a_cut_drive_gives_the_same_map_over_zenoh() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = raw_zenoh::free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let zenoh_listen = endpoint.parse().unwrap();
     let config = ServerConfig { zenoh_mode: ZenohMode::Router, zenoh_listen, ..cutting(folder.path()) };
     let server = Server::start(config).await.unwrap();

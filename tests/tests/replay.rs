@@ -15,10 +15,10 @@ use lanemap_openlane::Drives;
 use lanemap_server::{Server, ServerConfig, config::ZenohMode};
 use lanemap_simulator::{OdometryNoise, Scenario, openlane::write_simulation};
 use lanemap_tests::{
+    endpoints::HeldEndpoint,
     folders::files,
     http,
     proxy::{Fault, Proxy},
-    raw_zenoh::free_endpoint,
     servers,
 };
 use serde_json::Value;
@@ -94,7 +94,7 @@ async fn a_drive_replayed_over_grpc_gives_the_lanes_and_the_local_maps_of_a_loca
 async fn a_drive_replayed_over_zenoh_gives_the_map_of_a_local_replay() {
     let drives = recorded(11, 1, 300.0);
     let store = tempfile::tempdir().unwrap();
-    let zenoh = free_endpoint();
+    let zenoh = HeldEndpoint::tcp();
     let config = ServerConfig {
         zenoh_mode: ZenohMode::Router,
         zenoh_listen: zenoh.parse().unwrap(),

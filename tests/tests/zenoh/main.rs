@@ -23,8 +23,9 @@ use lanemap_server::{
 };
 use lanemap_tests::{
     drives::{self, Drive, assert_same_map},
+    endpoints::HeldEndpoint,
     raw_stream::RawStream,
-    raw_zenoh::{self, RawZenohStream, free_endpoint},
+    raw_zenoh::{self, RawZenohStream},
     servers::{self, map_bytes},
 };
 use tonic::Code;
@@ -46,8 +47,8 @@ async fn server_and_session(folder: &Path) -> (RunningServer, zenoh::Session) {
 async fn server_with(
     folder: &Path,
     set: impl FnOnce(ServerConfig) -> ServerConfig,
-) -> (RunningServer, String, zenoh::Session) {
-    let endpoint = free_endpoint();
+) -> (RunningServer, HeldEndpoint, zenoh::Session) {
+    let endpoint = HeldEndpoint::tcp();
     let server = Server::start(set(config(folder, &endpoint))).await.unwrap();
     let session = raw_zenoh::connect(&endpoint).await;
     (server, endpoint, session)
@@ -93,7 +94,7 @@ impl Drop for Process {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_drive_gives_the_same_bytes_over_grpc_over_zenoh_and_from_the_journal() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = Process::start(folder.path(), &endpoint);
     let session = raw_zenoh::connect(&endpoint).await;
     let drive = drives::simulated(5, 150);
@@ -208,7 +209,7 @@ async fn a_newer_stream_takes_over_whichever_way_it_comes() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_killed_in_mid_drive_is_found_again_and_the_drive_goes_on() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = Process::start(folder.path(), &endpoint);
     let session = raw_zenoh::connect(&endpoint).await;
     let drive = drives::simulated(8, 120);
@@ -230,7 +231,7 @@ async fn a_server_killed_in_mid_drive_is_found_again_and_the_drive_goes_on() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_shutdown_closes_streams_with_unavailable_and_keeps_what_was_acked() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = Server::start(config(folder.path(), &endpoint)).await.unwrap();
     let session = raw_zenoh::connect(&endpoint).await;
     let drive = drives::simulated(9, 40);
@@ -251,7 +252,7 @@ async fn a_shutdown_closes_streams_with_unavailable_and_keeps_what_was_acked() {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_a_link_loses_is_fetched_again_and_the_map_is_the_same() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = Server::start(config(folder.path(), &endpoint)).await.unwrap();
     // A vehicle whose link lets five messages a second through, and loses all others.
     let mut lossy = raw_zenoh::configuration("client", &[], &[&endpoint]);
@@ -273,7 +274,7 @@ async fn what_a_link_loses_is_fetched_again_and_the_map_is_the_same() {
 async fn no_log_and_no_metric_names_a_vehicle_that_streams_over_zenoh() {
     const VEHICLE: &str = "nobody-may-read-this";
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let server = Process::start(folder.path(), &endpoint);
     let session = raw_zenoh::connect(&endpoint).await;
     let drive = drives::simulated(7, 10);

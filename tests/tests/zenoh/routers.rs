@@ -9,7 +9,8 @@ use lanemap_server::{
 };
 use lanemap_tests::{
     drives::{self, assert_same_map},
-    raw_zenoh::{self, RawZenohStream, free_endpoint},
+    endpoints::HeldEndpoint,
+    raw_zenoh::{self, RawZenohStream},
     servers::{self, map_bytes},
 };
 
@@ -23,7 +24,7 @@ fn client_of(endpoint: &str, folder: &Path) -> ServerConfig {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_that_is_a_client_of_a_router_serves_the_same() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let router = zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[])).await.unwrap();
     let server = Server::start(client_of(&endpoint, folder.path())).await.unwrap();
     let session = raw_zenoh::connect(&endpoint).await;
@@ -47,7 +48,7 @@ async fn a_server_that_is_a_client_of_a_router_serves_the_same() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let start_router = || zenoh::open(raw_zenoh::configuration("router", &[&endpoint], &[]));
     let router = start_router().await.unwrap();
     let server = Server::start(client_of(&endpoint, folder.path())).await.unwrap();
@@ -74,7 +75,7 @@ async fn a_router_that_is_started_anew_is_found_again_by_the_server() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_waits_for_its_router_a_while_and_then_says_which_it_was() {
     let folder = tempfile::tempdir().unwrap();
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let settings = client_of(&endpoint, folder.path());
     let (server, router) = tokio::join!(
         Server::start(settings.clone()),
@@ -83,14 +84,14 @@ async fn a_server_waits_for_its_router_a_while_and_then_says_which_it_was() {
     server.unwrap().shutdown().await;
     router.unwrap().close().await.unwrap();
     let error = Server::start(settings).await.unwrap_err().to_string();
-    assert!(error.contains(&endpoint), "{error}");
+    assert!(error.contains(&*endpoint), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_endpoint_that_is_taken_is_named() {
     let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let endpoint = free_endpoint();
+    let endpoint = HeldEndpoint::tcp();
     let _server = Server::start(config(folder.path(), &endpoint)).await.unwrap();
     let error = Server::start(config(other.path(), &endpoint)).await.unwrap_err().to_string();
-    assert!(error.contains(&endpoint), "{error}");
+    assert!(error.contains(&*endpoint), "{error}");
 }

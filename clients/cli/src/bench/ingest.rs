@@ -107,7 +107,7 @@ fn over_grpc(args: &IngestArgs, tapes: Vec<Tape>) -> anyhow::Result<ExitCode> {
 }
 
 fn over_zenoh(args: &IngestArgs, tapes: Vec<Tape>) -> anyhow::Result<ExitCode> {
-    let free = server_process::free_zenoh_endpoint()?;
+    let (free, _held) = server_process::free_zenoh_endpoint()?;
     let spawned = if args.spawn { Some(ServerProcess::serve(Some(&free))?) } else { None };
     let given = args.server.as_deref().unwrap_or(DEFAULT_ENDPOINT);
     let endpoint = if spawned.is_some() { &free } else { given };

@@ -3,12 +3,13 @@
 use std::{
     fs,
     io::{BufRead, BufReader},
-    net::{Ipv4Addr, TcpListener},
+    net::Ipv4Addr,
     process::{Child, Command, Stdio},
 };
 
 use anyhow::Context;
 use tempfile::TempDir;
+use tokio::net::TcpSocket;
 
 /// A process that serves until this is dropped, and the folder that it writes into.
 #[derive(Debug)]
@@ -68,10 +69,13 @@ impl Drop for ServerProcess {
     }
 }
 
-/// An endpoint of zenoh on this machine at which nobody listens now.
-pub fn free_zenoh_endpoint() -> anyhow::Result<String> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
-    Ok(format!("tcp/{}", listener.local_addr()?))
+/// An endpoint of zenoh on this machine at which nobody listens, and what keeps its port from others meanwhile: a socket
+/// that is bound and does not listen, beside which the server may.
+pub fn free_zenoh_endpoint() -> anyhow::Result<(String, TcpSocket)> {
+    let held = TcpSocket::new_v4()?;
+    held.set_reuseaddr(true)?;
+    held.bind((Ipv4Addr::LOCALHOST, 0).into())?;
+    Ok((format!("tcp/{}", held.local_addr()?), held))
 }
 
 /// Memory that the process of a server elsewhere holds, MB, as its metrics say.

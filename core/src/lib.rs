@@ -46,6 +46,7 @@ pub mod association;
 pub mod category;
 pub mod error;
 pub mod evaluation;
+pub mod fleet;
 pub mod frame;
 pub mod geometry;
 pub mod landmark;

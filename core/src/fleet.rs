@@ -1,0 +1,31 @@
+//! One map from many drives: what each drive contributes, how drives are aligned with each other, and how their lanes
+//! become the lines of one map.
+//!
+//! [`fuse`] is a pure function of the contributions, whatever their order of arrival:
+//!
+//! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
+//! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
+//!    shifts, which must be unique to be believed.
+//! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one.
+//! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
+//! 5. [`line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
+
+pub mod alignment;
+pub mod contribution;
+pub mod correction;
+pub mod fusion;
+pub mod line;
+pub mod matching;
+pub mod params;
+mod persistence;
+pub mod placement;
+mod prepared;
+mod sparse;
+pub mod trace;
+
+pub use contribution::{Contribution, DriveId, TrajectoryPoint};
+pub use correction::Correction;
+pub use fusion::{FusedDrive, FusedMap, fuse};
+pub use line::{FusedLane, FusedLaneId, FusedPoint};
+pub use params::FleetParams;
+pub use trace::Trace;

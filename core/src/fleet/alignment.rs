@@ -1,0 +1,305 @@
+//! Alignment: the corrections of drives and the places of lines, in one robust least-squares problem.
+//!
+//! Unknown are, per drive, the knots of its [`Correction`] and what all its GNSS fixes have in common, and, per station of
+//! a line, where the line lies across. Minimised is the sum of
+//!
+//! * `|c'_{k+1} - T_k(c_{k+1})|^2 / (q d) + (psi_{k+1} - psi_k)^2 / (q_psi d)`: odometry between knots,
+//! * `|C(p) + b - g|^2 / s_g^2 + |b|^2 / s_b^2`: fixes `g`, and their bias `b`, which is a drive's own,
+//! * `rho(n . C(p) - mu) / s^2`: a lane's sample against the station `mu` of its line, along the line's normal `n`.
+//!
+//! `rho` is Geman and McClure's, whose weight is `(c^2 / (c^2 + r^2))^2`. Heights are a problem of their own, with one unknown per knot:
+//! to first order they do not depend on the rest. Gauss-Newton; the normal equations are sparse. Since every drive has a
+//! bias of its own and none is the truth, the map lies at the mean of what their receivers say, and its
+//! variance falls with their number.
+//!
+//! Not guaranteed: the right minimum. It is found where matching is right for most; [`placement`](super::placement) sees to that.
+
+use nalgebra::{Point3, Vector2};
+
+use super::{correction::Correction, params::FleetParams, prepared::PreparedDrive, sparse::NormalEquations};
+
+/// Where a sample should lie along its normal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Target {
+    /// On a line that stays where it is, given as the position along the normal, metres.
+    Fixed(f64),
+    /// On a station that is itself unknown.
+    Station(usize),
+}
+
+/// A sample of a drive's lane that lies on a line.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sighting {
+    pub(super) drive: usize,
+    pub(super) arc_m: f64,
+    /// Map frame of the drive.
+    pub(super) map: Point3<f64>,
+    /// Normal of the line, shared frame.
+    pub(super) normal: Vector2<f64>,
+    pub(super) across: Target,
+    pub(super) height: Target,
+    pub(super) lateral_variance_m2: f64,
+    pub(super) height_variance_m2: f64,
+}
+
+/// Unknowns of a drive's horizontal problem: 3 per knot, and 2 of the bias.
+struct Layout {
+    first: Vec<usize>,
+    stations: usize,
+    unknowns: usize,
+}
+
+const GAUSS_NEWTON_STEPS: usize = 2;
+/// Holds what nothing else holds, 1/m^2.
+const WEAK: f64 = 1e-9;
+
+/// Solves for the corrections of `drives` (as many corrections), with `stations` stations.
+pub(super) fn align(
+    drives: &[&PreparedDrive<'_>],
+    corrections: &mut [Correction],
+    sightings: &[Sighting],
+    stations: usize,
+    params: &FleetParams,
+) {
+    for _ in 0..GAUSS_NEWTON_STEPS {
+        align_horizontally(drives, corrections, sightings, stations, params);
+    }
+    align_heights(drives, corrections, sightings, stations, params);
+}
+
+/// Geman and McClure's weight of a residual.
+pub(super) fn robust_weight(residual_m: f64, scale_m: f64) -> f64 {
+    let ratio = scale_m * scale_m / (scale_m * scale_m + residual_m * residual_m);
+    ratio * ratio
+}
+
+impl Layout {
+    fn new(corrections: &[Correction], per_knot: usize, biases: usize, stations: usize) -> Self {
+        let mut next = 0;
+        let first = corrections.iter().map(|correction| {
+            let first = next;
+            next += correction.knots.len() * per_knot + biases;
+            first
+        });
+        let first: Vec<usize> = first.collect();
+        Self { first, stations: next, unknowns: next + stations }
+    }
+}
+
+/// Derivatives of `axis . C(p)` by the unknowns of the knots beside it.
+fn row_across(
+    first: usize,
+    correction: &Correction,
+    map: &Point3<f64>,
+    arc_m: f64,
+    axis: &Vector2<f64>,
+) -> Vec<(usize, f64)> {
+    let (knot, weight) = correction.locate(arc_m);
+    let mut row = Vec::with_capacity(8);
+    for (knot, weight) in [(knot, 1.0 - weight), (knot + 1, weight)] {
+        if weight > 0.0 {
+            let at = first + 3 * knot;
+            let by_yaw = correction.knots[knot].by_yaw(map).dot(axis);
+            row.extend([(at, weight * axis.x), (at + 1, weight * axis.y), (at + 2, weight * by_yaw)]);
+        }
+    }
+    row
+}
+
+fn align_horizontally(
+    drives: &[&PreparedDrive<'_>],
+    corrections: &mut [Correction],
+    sightings: &[Sighting],
+    stations: usize,
+    params: &FleetParams,
+) {
+    let layout = Layout::new(corrections, 3, 2, stations);
+    let mut equations = NormalEquations::new(layout.unknowns, WEAK);
+    for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
+        let first = layout.first[index];
+        add_odometry(&mut equations, first, drive, correction);
+        add_fixes(&mut equations, first, drive, correction, params);
+    }
+    // The scale of a residual against a station needs the station's place now: the mean of its sightings.
+    let residuals = residuals_across(corrections, sightings, stations);
+    for (sighting, residual) in sightings.iter().zip(residuals) {
+        let correction = &corrections[sighting.drive];
+        let mut row =
+            row_across(layout.first[sighting.drive], correction, &sighting.map, sighting.arc_m, &sighting.normal);
+        let place = correction.apply(&sighting.map, sighting.arc_m).coords.xy().dot(&sighting.normal);
+        let value = match sighting.across {
+            Target::Fixed(target) => target - place,
+            Target::Station(station) => {
+                row.push((layout.stations + station, -1.0));
+                -place
+            }
+        };
+        let weight = robust_weight(residual, params.robust_scale_m) / sighting.lateral_variance_m2;
+        equations.add(&row, value, weight);
+    }
+    let Some(step) = equations.solve() else { return };
+    for (correction, first) in corrections.iter_mut().zip(&layout.first) {
+        for (knot, step) in correction.knots.iter_mut().zip(step[*first..].chunks_exact(3)) {
+            knot.shared.x += step[0];
+            knot.shared.y += step[1];
+            knot.yaw_rad += step[2];
+        }
+    }
+}
+
+fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &PreparedDrive<'_>, correction: &Correction) {
+    for (index, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
+        let (before, after) = (first + 3 * index, first + 3 * (index + 1));
+        let predicted = pair[0].apply(&pair[1].map);
+        let residual = (pair[1].shared - predicted).xy();
+        let by_yaw = pair[0].by_yaw(&pair[1].map);
+        let weight = 1.0 / step.position_m2;
+        equations.add(&[(after, 1.0), (before, -1.0), (before + 2, -by_yaw.x)], -residual.x, weight);
+        equations.add(&[(after + 1, 1.0), (before + 1, -1.0), (before + 2, -by_yaw.y)], -residual.y, weight);
+        let turn = pair[1].yaw_rad - pair[0].yaw_rad;
+        equations.add(&[(after + 2, 1.0), (before + 2, -1.0)], -turn, 1.0 / step.yaw_rad2);
+    }
+}
+
+fn add_fixes(
+    equations: &mut NormalEquations,
+    first: usize,
+    drive: &PreparedDrive<'_>,
+    correction: &Correction,
+    params: &FleetParams,
+) {
+    let Some(last) = drive.fixes.last() else { return };
+    let bias = first + 3 * correction.knots.len();
+    let length_m = last.arc_m - drive.fixes[0].arc_m;
+    let deflation =
+        (drive.fixes.len() as f64 * params.gnss_correlation_m / (length_m + params.gnss_correlation_m)).max(1.0);
+    let mean_sigma_m = drive.fixes.iter().map(|fix| fix.horizontal_sigma_m).sum::<f64>() / drive.fixes.len() as f64;
+    let bias_sigma_m = mean_sigma_m.max(params.gnss_bias_sigma_m);
+    let offsets: Vec<Vector2<f64>> =
+        drive.fixes.iter().map(|fix| (fix.shared - correction.apply(&fix.map, fix.arc_m)).xy()).collect();
+    let common = median(&offsets);
+    for (fix, offset) in drive.fixes.iter().zip(&offsets) {
+        let sigma_m = params.gnss_shape_share * fix.horizontal_sigma_m;
+        let weight = robust_weight((offset - common).norm(), 4.0 * sigma_m) / (sigma_m * sigma_m * deflation);
+        for (axis, bias, value) in [(Vector2::x(), bias, offset.x), (Vector2::y(), bias + 1, offset.y)] {
+            let mut row = row_across(first, correction, &fix.map, fix.arc_m, &axis);
+            row.push((bias, 1.0));
+            equations.add(&row, value, weight);
+        }
+    }
+    for unknown in [bias, bias + 1] {
+        equations.add(&[(unknown, 1.0)], 0.0, bias_sigma_m.powi(-2));
+    }
+}
+
+/// The median of each coordinate.
+fn median(offsets: &[Vector2<f64>]) -> Vector2<f64> {
+    let of = |axis: usize| {
+        let mut values: Vec<f64> = offsets.iter().map(|offset| offset[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    };
+    Vector2::new(of(0), of(1))
+}
+
+/// How far each sighting lies from its target; from the median of its station, where that is unknown.
+fn residuals_across(corrections: &[Correction], sightings: &[Sighting], stations: usize) -> Vec<f64> {
+    let places = sightings.iter().map(|sighting| {
+        corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).coords.xy().dot(&sighting.normal)
+    });
+    residuals(&places.collect::<Vec<f64>>(), sightings.iter().map(|sighting| sighting.across), stations)
+}
+
+fn residuals(places: &[f64], targets: impl Iterator<Item = Target> + Clone, stations: usize) -> Vec<f64> {
+    let mut at_station: Vec<Vec<f64>> = vec![Vec::new(); stations];
+    for (place, target) in places.iter().zip(targets.clone()) {
+        if let Target::Station(station) = target {
+            at_station[station].push(*place);
+        }
+    }
+    let middle = at_station.iter_mut().map(|places| {
+        places.sort_by(f64::total_cmp);
+        match places.len() {
+            0 => 0.0,
+            count => 0.5 * (places[(count - 1) / 2] + places[count / 2]),
+        }
+    });
+    let middle: Vec<f64> = middle.collect();
+    let residual = |(place, target): (&f64, Target)| match target {
+        Target::Fixed(target) => place - target,
+        Target::Station(station) => place - middle[station],
+    };
+    places.iter().zip(targets).map(residual).collect()
+}
+
+fn align_heights(
+    drives: &[&PreparedDrive<'_>],
+    corrections: &mut [Correction],
+    sightings: &[Sighting],
+    stations: usize,
+    params: &FleetParams,
+) {
+    let layout = Layout::new(corrections, 1, 1, stations);
+    let mut equations = NormalEquations::new(layout.unknowns, WEAK);
+    for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
+        let first = layout.first[index];
+        for (knot, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
+            let residual = (pair[1].shared.z - pair[0].shared.z) - (pair[1].map.z - pair[0].map.z);
+            equations.add(&[(first + knot + 1, 1.0), (first + knot, -1.0)], -residual, 1.0 / step.height_m2);
+        }
+        add_fixed_heights(&mut equations, first, drive, correction, params);
+    }
+    let places: Vec<f64> =
+        sightings.iter().map(|sighting| corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).z).collect();
+    let residuals = residuals(&places, sightings.iter().map(|sighting| sighting.height), stations);
+    for ((sighting, place), residual) in sightings.iter().zip(&places).zip(residuals) {
+        let mut row = row_of_height(layout.first[sighting.drive], &corrections[sighting.drive], sighting.arc_m);
+        let value = match sighting.height {
+            Target::Fixed(target) => target - place,
+            Target::Station(station) => {
+                row.push((layout.stations + station, -1.0));
+                -place
+            }
+        };
+        let weight = robust_weight(residual, 2.0 * params.robust_scale_m) / sighting.height_variance_m2;
+        equations.add(&row, value, weight);
+    }
+    let Some(step) = equations.solve() else { return };
+    for (correction, first) in corrections.iter_mut().zip(&layout.first) {
+        for (knot, step) in correction.knots.iter_mut().zip(&step[*first..]) {
+            knot.shared.z += step;
+        }
+    }
+}
+
+fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Vec<(usize, f64)> {
+    let (knot, weight) = correction.locate(arc_m);
+    let mut row = vec![(first + knot, 1.0 - weight)];
+    if weight > 0.0 {
+        row.push((first + knot + 1, weight));
+    }
+    row
+}
+
+fn add_fixed_heights(
+    equations: &mut NormalEquations,
+    first: usize,
+    drive: &PreparedDrive<'_>,
+    correction: &Correction,
+    params: &FleetParams,
+) {
+    let Some(last) = drive.fixes.last() else { return };
+    let bias = first + correction.knots.len();
+    let length_m = last.arc_m - drive.fixes[0].arc_m;
+    let deflation =
+        (drive.fixes.len() as f64 * params.gnss_correlation_m / (length_m + params.gnss_correlation_m)).max(1.0);
+    let mean_sigma_m = drive.fixes.iter().map(|fix| fix.vertical_sigma_m).sum::<f64>() / drive.fixes.len() as f64;
+    for fix in &drive.fixes {
+        let sigma_m = params.gnss_shape_share * fix.vertical_sigma_m;
+        let mut row = row_of_height(first, correction, fix.arc_m);
+        row.push((bias, 1.0));
+        let offset = fix.shared.z - correction.apply(&fix.map, fix.arc_m).z;
+        equations.add(&row, offset, 1.0 / (sigma_m * sigma_m * deflation));
+    }
+    equations.add(&[(bias, 1.0)], 0.0, mean_sigma_m.max(params.gnss_bias_sigma_m).powi(-2));
+}

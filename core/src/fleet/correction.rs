@@ -1,0 +1,87 @@
+//! The smooth correction of a drive: from its own map frame to the shared one, 4 degrees of freedom that change along
+//! the way.
+//!
+//! At knots `k` along the trajectory lie the rigid transforms `T_k(p) = c'_k + R_z(psi_k) (p - c_k)`: `c_k` is the place of the
+//! knot in the drive's frame, `c'_k` in the shared one, `psi_k` the turn between the two. A point that was seen from arc
+//! length `s` between knots `k` and `k + 1` goes to `(1 - w) T_k(p) + w T_{k+1}(p)`, `w = (s - s_k) / (s_{k+1} - s_k)`:
+//! linear in `c'`, continuous, and rigid where the two knots agree.
+
+use nalgebra::{Point3, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// One knot of a correction.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CorrectionKnot {
+    /// Way from the start of the drive, metres.
+    pub arc_m: f64,
+    /// Place on the trajectory, map frame of the drive, metres.
+    pub map: Point3<f64>,
+    /// The same place in the shared frame, metres.
+    pub shared: Point3<f64>,
+    /// Turn about the vertical from the drive's frame to the shared one, radians.
+    pub yaw_rad: f64,
+}
+
+/// The correction of one drive; at least one knot.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Correction {
+    pub(super) knots: Vec<CorrectionKnot>,
+}
+
+impl CorrectionKnot {
+    /// `T_k(p)`.
+    #[must_use]
+    pub fn apply(&self, point_map: &Point3<f64>) -> Point3<f64> {
+        let offset = point_map - self.map;
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        let turned = Vector3::new(cos * offset.x - sin * offset.y, sin * offset.x + cos * offset.y, offset.z);
+        self.shared + turned
+    }
+
+    /// Derivative of `T_k(p)` by `psi_k`, horizontally.
+    pub(super) fn by_yaw(&self, point_map: &Point3<f64>) -> Vector2<f64> {
+        let offset = point_map - self.map;
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        Vector2::new(-sin * offset.x - cos * offset.y, cos * offset.x - sin * offset.y)
+    }
+}
+
+impl Correction {
+    /// The knots, in the order of travel.
+    #[must_use]
+    pub fn knots(&self) -> &[CorrectionKnot] {
+        &self.knots
+    }
+
+    /// Index of the knot before an arc length, and the weight of the one after it.
+    pub(super) fn locate(&self, arc_m: f64) -> (usize, f64) {
+        let after = self.knots.partition_point(|knot| knot.arc_m <= arc_m);
+        if after == 0 {
+            return (0, 0.0);
+        }
+        if after == self.knots.len() {
+            return (after - 1, 0.0);
+        }
+        let (before, next) = (&self.knots[after - 1], &self.knots[after]);
+        (after - 1, (arc_m - before.arc_m) / (next.arc_m - before.arc_m))
+    }
+
+    /// A point (map frame of the drive, metres) that was seen from an arc length of the way, in the shared frame.
+    #[must_use]
+    pub fn apply(&self, point_map: &Point3<f64>, arc_m: f64) -> Point3<f64> {
+        let (knot, weight) = self.locate(arc_m);
+        let before = self.knots[knot].apply(point_map);
+        if weight == 0.0 {
+            return before;
+        }
+        before + (self.knots[knot + 1].apply(point_map) - before) * weight
+    }
+
+    /// Turn from the drive's frame to the shared one at an arc length, radians.
+    #[must_use]
+    pub fn yaw_rad(&self, arc_m: f64) -> f64 {
+        let (knot, weight) = self.locate(arc_m);
+        let before = self.knots[knot].yaw_rad;
+        if weight == 0.0 { before } else { before + (self.knots[knot + 1].yaw_rad - before) * weight }
+    }
+}

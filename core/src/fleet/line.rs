@@ -1,0 +1,304 @@
+//! Lines of the shared map: knots 3 m apart, each the weighted mean of what the drives say of it.
+//!
+//! Fusion of splines on common knots, in information form. Catmull-Rom splines are not nested under knot insertion
+//! (`paper_notes.md` 2), so a drive's lane is projected: where the plane across the line at knot `k` cuts the lane's curve
+//! lies its witness `q_k`, with the variance that the drive's own map gives there. The knot lies at
+//! `sum w_i q_i / sum w_i` across the line, `w_i = rho_i / (s_i^2 + s_0^2)`: information adds, and since errors of one drive along
+//! one line are correlated, a drive is one witness at each knot, however many frames saw it. Its variance is `1 / sum w_i`.
+//! Near the ends of a drive's lane its weight tapers off, so that the mean does not jump where a witness comes or goes.
+
+use std::collections::{BTreeMap, HashMap};
+
+use nalgebra::{Point3, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::{
+    alignment::robust_weight,
+    contribution::DriveId,
+    correction::Correction,
+    params::FleetParams,
+    prepared::{PreparedLane, normal_of},
+};
+use crate::{
+    category::Category,
+    frame::TimestampNs,
+    lane_map::{EndRule, LaneId},
+    spline::curve::Curve,
+};
+
+/// Name of a line in the shared map: its oldest witness, so that it is the same in any order of arrival.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct FusedLaneId {
+    /// Start of the oldest drive that saw it.
+    pub started: TimestampNs,
+    /// That drive.
+    pub drive: DriveId,
+    /// The drive's lane.
+    pub lane: LaneId,
+    /// Which of the lines that this lane began, from 0.
+    pub piece: u32,
+    /// Which of the stretches of that line that are there, from 0.
+    pub stretch: u32,
+}
+
+/// One knot of a line, as fused.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FusedPoint {
+    /// Position, shared frame, metres.
+    pub position: Point3<f64>,
+    /// Standard deviation across the line against the map around it, metres.
+    pub lateral_sigma_m: f64,
+    /// Standard deviation of the height against the map around it, metres.
+    pub height_sigma_m: f64,
+    /// Drives that saw it.
+    pub drives: u32,
+    /// Probability that it is there, in `[0, 1]`.
+    pub existence: f64,
+}
+
+/// A line of the shared map.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FusedLane {
+    /// Its name.
+    pub id: FusedLaneId,
+    /// Most probable category.
+    pub category: Category,
+    /// Probability of each category, in the order of [`Category::ALL`]; sums to 1.
+    pub category_posterior: Vec<f64>,
+    /// Knots about 3 m apart, in the direction of travel of the oldest witness; at least 2. The curve reaches both ends.
+    pub points: Vec<FusedPoint>,
+    /// Drives that saw some of it.
+    pub drives: u32,
+    /// Frames that saw some of it.
+    pub observations: u64,
+    /// Time of the first frame that saw it.
+    pub first_seen: TimestampNs,
+    /// Time of the last frame that saw it.
+    pub last_seen: TimestampNs,
+}
+
+/// What one drive says of one knot.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Witness {
+    pub(super) drive: usize,
+    pub(super) lane: usize,
+    /// Map frame of the drive.
+    pub(super) map: Point3<f64>,
+    pub(super) arc_m: f64,
+    pub(super) lateral_variance_m2: f64,
+    pub(super) height_variance_m2: f64,
+    /// 1 within the drive's lane, less near its ends.
+    pub(super) share: f64,
+}
+
+/// A line while it is made.
+#[derive(Clone, Debug)]
+pub(super) struct Line {
+    pub(super) id: FusedLaneId,
+    pub(super) points: Vec<Point3<f64>>,
+    pub(super) witnesses: Vec<Vec<Witness>>,
+}
+
+/// All lines, and which run near a place.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Lines {
+    pub(super) lines: Vec<Line>,
+    grid: HashMap<(i32, i32), Vec<(u32, u32)>>,
+}
+
+const CELL_M: f64 = 8.0;
+/// Way over which a drive's weight grows from the end of its lane, metres.
+pub(super) const TAPER_M: f64 = 12.0;
+
+fn cell(x: f64, y: f64) -> (i32, i32) {
+    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, far beyond any map")]
+    let whole = |value: f64| (value / CELL_M).floor() as i32;
+    (whole(x), whole(y))
+}
+
+impl Line {
+    pub(super) fn curve(&self) -> Option<Curve<'_, [Point3<f64>]>> {
+        Curve::new(self.points.as_slice(), EndRule::Reflected)
+    }
+
+    /// Direction at a knot, of length 1.
+    pub(super) fn tangent(&self, knot: usize) -> Vector3<f64> {
+        let before = self.points[knot.saturating_sub(1)];
+        let after = self.points[(knot + 1).min(self.points.len() - 1)];
+        (after - before).try_normalize(1e-9).unwrap_or_else(Vector3::x)
+    }
+
+    /// Adds a witness to a knot. Of two of the same drive the more certain stays.
+    pub(super) fn testify(&mut self, knot: usize, witness: Witness) {
+        let at = &mut self.witnesses[knot];
+        match at.iter_mut().find(|other| other.drive == witness.drive) {
+            Some(other) if other.lateral_variance_m2 <= witness.lateral_variance_m2 => {}
+            Some(other) => *other = witness,
+            None => at.push(witness),
+        }
+    }
+
+    /// Puts every knot to the mean of its witnesses, across the line and in height.
+    pub(super) fn settle(&mut self, corrections: &[Correction], params: &FleetParams) {
+        let moved = (0..self.points.len()).map(|knot| {
+            let normal = normal_of(&self.tangent(knot));
+            let mean = self.mean_offset(knot, &normal, corrections, params);
+            self.points[knot] + Vector3::new(normal.x * mean.across_m, normal.y * mean.across_m, mean.height_m)
+        });
+        self.points = moved.collect();
+    }
+
+    /// Where the witnesses of a knot put it, from where it is.
+    pub(super) fn mean_offset(
+        &self,
+        knot: usize,
+        normal: &Vector2<f64>,
+        corrections: &[Correction],
+        params: &FleetParams,
+    ) -> MeanOffset {
+        let place = self.points[knot];
+        let offsets = self.witnesses[knot].iter().map(|witness| {
+            let offset = corrections[witness.drive].apply(&witness.map, witness.arc_m) - place;
+            (offset.xy().dot(normal), offset.z, witness)
+        });
+        let offsets: Vec<(f64, f64, &Witness)> = offsets.collect();
+        let across = offsets.iter().map(|(across, _, witness)| {
+            (*across, witness.share / (witness.lateral_variance_m2 + params.lane_sigma_m.powi(2)))
+        });
+        let height = offsets.iter().map(|(_, height, witness)| {
+            (*height, witness.share / (witness.height_variance_m2 + params.lane_sigma_height_m.powi(2)))
+        });
+        let (across_m, across_information) = robust_mean(&across.collect::<Vec<_>>(), params.robust_scale_m);
+        let (height_m, height_information) = robust_mean(&height.collect::<Vec<_>>(), 2.0 * params.robust_scale_m);
+        MeanOffset { across_m, height_m, across_information, height_information }
+    }
+}
+
+/// Mean of the witnesses of a knot.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct MeanOffset {
+    pub(super) across_m: f64,
+    pub(super) height_m: f64,
+    /// 1/m^2.
+    pub(super) across_information: f64,
+    /// 1/m^2.
+    pub(super) height_information: f64,
+}
+
+/// Mean of values with weights, from their weighted median by reweighting; and the sum of the weights that are left.
+fn robust_mean(values: &[(f64, f64)], scale_m: f64) -> (f64, f64) {
+    const ROUNDS: usize = 4;
+    let mut mean = weighted_median(values);
+    let mut information = 0.0;
+    for _ in 0..ROUNDS {
+        let mut sum = 0.0;
+        information = 0.0;
+        for (value, weight) in values {
+            let weight = weight * robust_weight(value - mean, scale_m);
+            sum += weight * value;
+            information += weight;
+        }
+        if information <= 0.0 {
+            return (mean, 0.0);
+        }
+        mean = sum / information;
+    }
+    (mean, information)
+}
+
+fn weighted_median(values: &[(f64, f64)]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = 0.5 * sorted.iter().map(|(_, weight)| weight).sum::<f64>();
+    let mut below = 0.0;
+    for (index, (value, weight)) in sorted.iter().enumerate() {
+        below += weight;
+        if below > half {
+            return *value;
+        }
+        if below == half && index + 1 < sorted.len() {
+            return 0.5 * (value + sorted[index + 1].0);
+        }
+    }
+    sorted.last().map_or(0.0, |(value, _)| *value)
+}
+
+impl Lines {
+    /// Adds a line and says which it is.
+    pub(super) fn push(&mut self, line: Line) -> usize {
+        self.lines.push(line);
+        self.lines.len() - 1
+    }
+
+    /// Finds knots by place again, after lines moved or grew.
+    pub(super) fn index(&mut self) {
+        self.grid.clear();
+        for (number, line) in self.lines.iter().enumerate() {
+            for (knot, point) in line.points.iter().enumerate() {
+                #[expect(clippy::cast_possible_truncation, reason = "a map has fewer than 2^32 lines and knots")]
+                self.grid.entry(cell(point.x, point.y)).or_default().push((number as u32, knot as u32));
+            }
+        }
+    }
+
+    /// Calls `visit` with line, knot and place of every knot within about a radius of a place, horizontally.
+    pub(super) fn for_each_knot_near(
+        &self,
+        place: &Point3<f64>,
+        radius_m: f64,
+        mut visit: impl FnMut(usize, usize, &Point3<f64>),
+    ) {
+        let (low, high) = (cell(place.x - radius_m, place.y - radius_m), cell(place.x + radius_m, place.y + radius_m));
+        for x in low.0..=high.0 {
+            for y in low.1..=high.1 {
+                for (line, knot) in self.grid.get(&(x, y)).into_iter().flatten() {
+                    let (line, knot) = (*line as usize, *knot as usize);
+                    visit(line, knot, &self.lines[line].points[knot]);
+                }
+            }
+        }
+    }
+
+    /// The lines within a radius of a place, horizontally, each with its nearest knot, in the order of the lines.
+    pub(super) fn near(&self, place: &Point3<f64>, radius_m: f64) -> Vec<(usize, usize)> {
+        let (low, high) = (cell(place.x - radius_m, place.y - radius_m), cell(place.x + radius_m, place.y + radius_m));
+        let mut nearest: BTreeMap<u32, (f64, u32)> = BTreeMap::new();
+        for x in low.0..=high.0 {
+            for y in low.1..=high.1 {
+                for (line, knot) in self.grid.get(&(x, y)).into_iter().flatten() {
+                    let distance = (self.lines[*line as usize].points[*knot as usize] - place).xy().norm_squared();
+                    if distance <= radius_m * radius_m {
+                        let best = nearest.entry(*line).or_insert((distance, *knot));
+                        if distance < best.0 {
+                            *best = (distance, *knot);
+                        }
+                    }
+                }
+            }
+        }
+        nearest.into_iter().map(|(line, (_, knot))| (line as usize, knot as usize)).collect()
+    }
+}
+
+/// The witness that a drive's lane is at a spline parameter of its own.
+pub(super) fn witness_at(
+    drive: usize,
+    lane_index: usize,
+    lane: &PreparedLane<'_>,
+    sample: usize,
+    parameter: f64,
+) -> Witness {
+    let near = &lane.samples[sample];
+    let (first, last) = (&lane.samples[0], &lane.samples[lane.samples.len() - 1]);
+    let map = lane.curve.point(parameter);
+    let to_end_m = nalgebra::distance(&map, &first.map).min(nalgebra::distance(&map, &last.map));
+    Witness {
+        drive,
+        lane: lane_index,
+        map,
+        arc_m: near.arc_m,
+        lateral_variance_m2: near.lateral_variance_m2,
+        height_variance_m2: near.height_variance_m2,
+        share: (to_end_m / TAPER_M).clamp(0.05, 1.0),
+    }
+}

@@ -1,0 +1,126 @@
+//! Persistence: whether a stretch of line is there, from the drives that saw it, that missed it, and that could not see it.
+//!
+//! A two-state filter per knot, after Rosen, Mason and Leonard, *Towards Lifelong Feature-Based Mapping in Semi-Static
+//! Environments* (ICRA 2016), with a constant hazard per drive in place of their survival prior. With `p` the
+//! probability that the paint is there, each drive in the order of time first lets it come or go, `p <- p (1 - h) + (1 - p) b`, and
+//! then speaks: `odds(p) *= P(what it says | there) / P(what it says | not there)`. A drive that did not have the knot
+//! in view says nothing.
+//!
+//! A drive has a knot in view if its camera was within range and angle of it, unhidden, at [`LEAST_VIEWS`] places of its way.
+
+use nalgebra::{Point3, Vector3};
+
+use super::{correction::Correction, line::Lines, prepared::PreparedDrive};
+
+/// What a drive says of a knot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Evidence {
+    /// It has it among its lanes.
+    Seen,
+    /// It had it in view, and has no such lane.
+    Missed,
+}
+
+/// Probability that a line that is there is among a drive's lanes, near the vehicle's own lane.
+const SEEN_NEAR: f64 = 0.9;
+/// The same farther to the side.
+const SEEN_FAR: f64 = 0.75;
+/// Probability that a drive has a lane where there is none.
+const SEEN_GHOST: f64 = 0.05;
+/// Probability that a line goes, and that one comes, between two drives.
+const HAZARD: f64 = 0.01;
+/// Distance to the side from which a line counts as far, metres.
+const FAR_M: f64 = 6.0;
+/// Nearest and farthest place ahead at which a line is expected to be seen, metres.
+const AHEAD_M: std::ops::Range<f64> = 5.0..28.0;
+/// Farthest place to the side at which a line is expected to be seen, metres.
+const SIDE_M: f64 = 9.0;
+/// Places of the way from which a knot must be in view.
+pub(super) const LEAST_VIEWS: u16 = 3;
+/// Every how many points of a trajectory one is looked at.
+const STRIDE: usize = 1;
+
+/// How one drive had each knot in view.
+#[derive(Clone, Debug)]
+pub(super) struct Views {
+    /// Per line and knot: from how many places, and the least distance to the side.
+    pub(super) of: Vec<Vec<(u16, f32)>>,
+}
+
+/// Belief that a knot is there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Belief {
+    pub(super) probability: f64,
+}
+
+impl Belief {
+    /// Before any drive.
+    pub(super) fn new() -> Self {
+        Self { probability: 0.5 }
+    }
+
+    /// Takes what the next drive says.
+    pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64) {
+        let coming = self.probability * (1.0 - HAZARD) + (1.0 - self.probability) * HAZARD;
+        let seen = if to_the_side_m < FAR_M { SEEN_NEAR } else { SEEN_FAR };
+        let (there, not_there) = match evidence {
+            Evidence::Seen => (seen, SEEN_GHOST),
+            Evidence::Missed => (1.0 - seen, 1.0 - SEEN_GHOST),
+        };
+        self.probability = coming * there / (coming * there + (1.0 - coming) * not_there);
+    }
+}
+
+/// Which knots a drive had in view.
+pub(super) fn views(drive: &PreparedDrive<'_>, correction: &Correction, lines: &Lines) -> Views {
+    let mut of: Vec<Vec<(u16, f32)>> = lines.lines.iter().map(|line| vec![(0, f32::MAX); line.points.len()]).collect();
+    let sensor = &drive.contribution.sensor;
+    for point in drive.contribution.trajectory.iter().step_by(STRIDE) {
+        let place = correction.apply(&point.position, point.arc_m);
+        let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
+        let middle = place + Vector3::new(cos, sin, 0.0) * (0.5 * (AHEAD_M.start + AHEAD_M.end));
+        lines.for_each_knot_near(&middle, 16.0, |line, knot, at: &Point3<f64>| {
+            let offset = at - place;
+            let ahead = cos * offset.x + sin * offset.y;
+            let left = -sin * offset.x + cos * offset.y;
+            if !AHEAD_M.contains(&ahead) || left.abs() > SIDE_M || offset.z.abs() > 3.0 {
+                return;
+            }
+            if sensor.sees(&Point3::new(ahead, left, offset.z)) {
+                let (views, side_m) = &mut of[line][knot];
+                *views += 1;
+                #[expect(clippy::cast_possible_truncation, reason = "metres to the side")]
+                let left_m = left.abs() as f32;
+                *side_m = side_m.min(left_m);
+            }
+        });
+    }
+    Views { of }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(evidence: &[Evidence]) -> f64 {
+        let mut belief = Belief::new();
+        evidence.iter().for_each(|evidence| belief.hear(*evidence, 2.0));
+        belief.probability
+    }
+
+    #[test]
+    fn one_drive_suffices_until_others_miss_what_it_saw() {
+        use Evidence::{Missed, Seen};
+        assert!(after(&[Seen]) > 0.9);
+        assert!(after(&[Seen, Missed, Missed]) < 0.5);
+        assert!(after(&[Seen, Seen, Missed, Seen]) > 0.9);
+    }
+
+    #[test]
+    fn a_line_that_goes_is_given_up_within_three_drives() {
+        use Evidence::{Missed, Seen};
+        let mut drives = vec![Seen; 30];
+        drives.extend([Missed; 3]);
+        assert!(after(&drives) < 0.5);
+    }
+}

@@ -6,4 +6,4 @@ pub mod route;
 
 pub use motion::{MotionModel, TrueState};
 pub use path::Path;
-pub use route::{Leg, Route};
+pub use route::{LaneChange, Leg, Route};

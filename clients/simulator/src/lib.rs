@@ -2,7 +2,8 @@
 //!
 //! [`Simulation::run`] builds a [`road::RoadNetwork`] (hills, curves, junctions, splits and merges), drives through it
 //! and lets a [`detector::Detector`] watch. A [`SimulatedDrive`] holds the truth, and gives the frames that a vehicle
-//! would stream; a [`DriveSimulation`] gives them one by one; [`openlane`] writes it all as `OpenLane` folders. Each model stands in a file of its own, with its
+//! would stream; a [`DriveSimulation`] gives them one by one; [`openlane`] writes it all as `OpenLane` folders. [`fleet`]
+//! has many drives over days, for maps that are fused from them. Each model stands in a file of its own, with its
 //! equations and figures.
 //!
 //! ```
@@ -16,6 +17,7 @@
 pub mod camera;
 pub mod detector;
 pub mod drive;
+pub mod fleet;
 pub mod gnss;
 pub mod noise;
 pub mod odometry;
@@ -28,6 +30,7 @@ pub mod truth_map;
 pub mod view;
 
 pub use camera::Camera;
+pub use fleet::{Fleet, FleetScenario};
 pub use odometry::OdometryNoise;
 pub use random::Seed;
 pub use scenario::Scenario;

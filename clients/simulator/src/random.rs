@@ -34,6 +34,14 @@ pub enum Purpose {
     Gnss = 7,
     /// Track numbers of detections in written files.
     TrackIds = 8,
+    /// Other vehicles on the road.
+    Traffic = 9,
+    /// Changes of the road.
+    Changes = 10,
+    /// What is wrong with a drive.
+    Poison = 11,
+    /// Where buildings spoil GNSS.
+    Canyons = 12,
 }
 
 impl Seed {

@@ -75,10 +75,15 @@ impl TruthMap {
                 line: *line,
                 category: seen.category,
                 frames_seen: seen.frames,
-                points: network.line(*line).points[seen.stretch.clone()].to_vec(),
+                points: stretch_of(network.line(*line), &seen.stretch),
             })
             .collect()
     }
+}
+
+/// The points of a stretch; all of a closed line where the stretch runs on past its end.
+fn stretch_of(line: &RoadLine, stretch: &Range<usize>) -> Vec<Point3<f64>> {
+    line.points.get(stretch.clone()).unwrap_or(&line.points).to_vec()
 }
 
 #[cfg(test)]

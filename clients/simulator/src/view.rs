@@ -2,7 +2,7 @@
 //!
 //! A line is annotated where it falls in the image, up to 75 m ahead of the camera, as its longest unbroken run; lines
 //! that cross the view at more than 60 degrees and roads off the route are left out, as in OpenLane. At most eight
-//! lines, those nearest to the vehicle's sides. Occlusion is not simulated.
+//! lines, those nearest to the vehicle's sides. What other vehicles hide is for [`crate::fleet`] to say.
 
 use std::ops::Range;
 
@@ -36,7 +36,7 @@ pub struct LineView {
     pub points_vehicle: Vec<Point3<f64>>,
     /// The visible part of `points_vehicle`.
     pub visible: Range<usize>,
-    /// Indices of the visible part in the line's own points.
+    /// Indices of the visible part in the line's own points; of a closed line they may run on past its end.
     pub stretch: Range<usize>,
 }
 
@@ -63,13 +63,31 @@ pub fn lines_in_view(
     world_from_vehicle: &Pose,
     sensor: &Sensor,
 ) -> Vec<LineView> {
-    let mut views: Vec<LineView> = legs
-        .iter()
-        .skip(leg)
-        .take(LEGS_IN_SIGHT)
-        .flat_map(|leg| network.link(leg.link).lines.iter().map(move |id| (network.line(*id), leg.forward)))
-        .filter_map(|(line, forward)| view_of(line, forward, world_from_vehicle, sensor))
-        .collect();
+    let lines = line_ids_ahead(network, legs, leg).into_iter().map(|(id, forward)| (network.line(id), forward));
+    views_of(lines, world_from_vehicle, sensor)
+}
+
+/// The lines of the leg `leg` of a route and of the next ones, each once, and whether they are faced in their direction.
+pub(crate) fn line_ids_ahead(network: &RoadNetwork, legs: &[Leg], leg: usize) -> Vec<(RoadLineId, bool)> {
+    let mut lines: Vec<(RoadLineId, bool)> = Vec::new();
+    for leg in legs.iter().skip(leg).take(LEGS_IN_SIGHT) {
+        for id in &network.link(leg.link).lines {
+            if !lines.contains(&(*id, leg.forward)) {
+                lines.push((*id, leg.forward));
+            }
+        }
+    }
+    lines
+}
+
+/// Those of `lines` that are in sight from a pose, from left to right; each with whether it is faced in its direction.
+pub(crate) fn views_of<'a>(
+    lines: impl Iterator<Item = (&'a RoadLine, bool)>,
+    world_from_vehicle: &Pose,
+    sensor: &Sensor,
+) -> Vec<LineView> {
+    let mut views: Vec<LineView> =
+        lines.filter_map(|(line, forward)| view_of(line, forward, world_from_vehicle, sensor)).collect();
     views.sort_by(|a, b| a.side_m().abs().total_cmp(&b.side_m().abs()));
     views.truncate(MAX_LINES);
     views.sort_by(|a, b| b.side_m().total_cmp(&a.side_m()));
@@ -77,9 +95,14 @@ pub fn lines_in_view(
 }
 
 fn view_of(line: &RoadLine, forward: bool, world_from_vehicle: &Pose, sensor: &Sensor) -> Option<LineView> {
-    let near = indices_near(line, &world_from_vehicle.translation.vector.into())?;
-    let mut points: Vec<Point3<f64>> =
-        line.points[near.clone()].iter().map(|point| world_from_vehicle.inverse_transform_point(point)).collect();
+    let place = world_from_vehicle.translation.vector.into();
+    let near = if line.is_closed() { turn_round(line, &place)? } else { indices_near(line, &place)? };
+    let around = line.points.len().max(2) - 1;
+    let mut points: Vec<Point3<f64>> = near
+        .clone()
+        .map(|index| if index <= around { index } else { index - around })
+        .map(|index| world_from_vehicle.inverse_transform_point(&line.points[index]))
+        .collect();
     if !forward {
         points.reverse();
     }
@@ -109,6 +132,14 @@ fn indices_near(line: &RoadLine, place: &Point3<f64>) -> Option<Range<usize>> {
     let first = line.points.chunks(CHUNK).position(is_near)?;
     let last = count - 1 - line.points.chunks(CHUNK).rev().position(is_near)?;
     Some(first * CHUNK..((last + 1) * CHUNK).min(line.points.len()))
+}
+
+/// The indices once round a closed line from where it is farthest from a place, or `None` where all of it is far.
+fn turn_round(line: &RoadLine, place: &Point3<f64>) -> Option<Range<usize>> {
+    indices_near(line, place)?;
+    let distances = line.points.iter().map(|point| (point - place).norm_squared());
+    let (farthest, _) = distances.enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some(farthest..farthest + line.points.len() - 1)
 }
 
 fn runs_ahead(points: &[Point3<f64>], k: usize) -> bool {

@@ -107,8 +107,9 @@ impl MotionModel {
         let count = crate::count_of(length_m / PROFILE_STEP_M) + 1;
         let mut speeds_mps: Vec<f64> = (0..count)
             .map(|k| {
-                let curvature = path.at(k as f64 * PROFILE_STEP_M).curvature_per_m.abs().max(1e-9);
-                cruise_mps.min((self.lateral_acceleration_mps2 / curvature).sqrt()).max(CRAWL_MPS)
+                let here = path.at(k as f64 * PROFILE_STEP_M);
+                let curvature = here.curvature_per_m.abs().max(1e-9);
+                (cruise_mps * here.speed_scale).min((self.lateral_acceleration_mps2 / curvature).sqrt()).max(CRAWL_MPS)
             })
             .collect();
         let gained = 2.0 * self.acceleration_mps2 * PROFILE_STEP_M;

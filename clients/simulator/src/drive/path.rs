@@ -6,21 +6,17 @@
 use nalgebra::{Point2, Vector2};
 
 use crate::{
-    drive::route::{Leg, Route},
+    drive::route::{LANE_CHANGE_M, Leg, Route},
     noise::SmoothNoise,
-    road::{
-        RoadNetwork,
-        cross_section::{LANE_WIDTH_M, smooth_step},
-        reference_line::wrap,
-    },
+    road::{RoadNetwork, cross_section::smooth_step, reference_line::wrap},
 };
 
 /// Half width of the running mean, points (about metres).
 const SMOOTHING_HALF_WIDTH: usize = 4;
 /// Times that the running mean is applied.
 const SMOOTHING_PASSES: usize = 3;
-/// Length of a lane change, metres.
-const LANE_CHANGE_M: f64 = 70.0;
+/// Links whose lane centres are nearer to one another than this join without a curve between, metres.
+const SEAMLESS_M: f64 = 0.6;
 
 /// A path in plan, parameterised by the distance driven.
 #[derive(Clone, Debug)]
@@ -28,7 +24,15 @@ pub struct Path {
     points: Vec<Point2<f64>>,
     headings_rad: Vec<f64>,
     distances_m: Vec<f64>,
-    legs: Vec<usize>,
+    lanes: Vec<LanePlace>,
+}
+
+/// Where a point of a path lies on its road.
+#[derive(Clone, Copy, Debug)]
+struct LanePlace {
+    leg: usize,
+    right_of_reference_m: f64,
+    speed_scale: f64,
 }
 
 /// A place on a path.
@@ -42,17 +46,21 @@ pub struct PathPoint {
     pub curvature_per_m: f64,
     /// Index of the leg of the route.
     pub leg: usize,
+    /// How far the lane's centre lies to the right of the link's reference line, as the vehicle faces it, metres.
+    pub right_of_reference_m: f64,
+    /// How much faster than in a street one drives here.
+    pub speed_scale: f64,
 }
 
 impl Path {
     /// The path along a route, displaced to the left by `wander` (metres, of the distance driven).
     #[must_use]
     pub fn along(network: &RoadNetwork, route: &Route, wander: &SmoothNoise) -> Self {
-        let (mut points, legs) = lane_centres(network, route);
+        let (mut points, lanes) = lane_centres(network, route);
         for _ in 0..SMOOTHING_PASSES {
             points = running_mean(&points);
         }
-        let centre = Self::from_points(points, legs);
+        let centre = Self::from_points(points, lanes);
         let displaced = (0..centre.points.len())
             .map(|k| {
                 let heading_rad = centre.headings_rad[k];
@@ -60,10 +68,10 @@ impl Path {
                 centre.points[k] + left * wander.at(centre.distances_m[k])
             })
             .collect();
-        Self::from_points(displaced, centre.legs)
+        Self::from_points(displaced, centre.lanes)
     }
 
-    fn from_points(points: Vec<Point2<f64>>, legs: Vec<usize>) -> Self {
+    fn from_points(points: Vec<Point2<f64>>, lanes: Vec<LanePlace>) -> Self {
         let mut distances_m = Vec::with_capacity(points.len());
         let mut driven_m = 0.0;
         for (k, point) in points.iter().enumerate() {
@@ -80,7 +88,7 @@ impl Path {
             let previous = headings_rad.last().copied().unwrap_or(raw);
             headings_rad.push(previous + wrap(raw - previous));
         }
-        Self { points, headings_rad, distances_m, legs }
+        Self { points, headings_rad, distances_m, lanes }
     }
 
     /// Length, metres.
@@ -101,41 +109,56 @@ impl Path {
             place: self.points[before] + (self.points[after] - self.points[before]) * share,
             heading_rad: self.headings_rad[before] + turn_rad * share,
             curvature_per_m: turn_rad / step_m,
-            leg: self.legs[before],
+            leg: self.lanes[before].leg,
+            right_of_reference_m: self.lanes[before].right_of_reference_m,
+            speed_scale: self.lanes[before].speed_scale,
         }
     }
 }
 
-/// Points about one metre apart along the lane centres, each with its leg.
-fn lane_centres(network: &RoadNetwork, route: &Route) -> (Vec<Point2<f64>>, Vec<usize>) {
+/// Points about one metre apart along the lane centres, each with its place on the road.
+fn lane_centres(network: &RoadNetwork, route: &Route) -> (Vec<Point2<f64>>, Vec<LanePlace>) {
     let mut points: Vec<Point2<f64>> = Vec::new();
-    let mut legs = Vec::new();
+    let mut lanes: Vec<LanePlace> = Vec::new();
     for (index, leg) in route.legs.iter().enumerate() {
-        let centre = lane_centre(network, leg);
+        let (mut centre, mut offsets_m) = lane_centre(network, leg);
+        let speed_scale = network.link(leg.link).kind.speed_scale();
+        let place = |right_of_reference_m: f64| LanePlace { leg: index, right_of_reference_m, speed_scale };
         if let [.., before, end] = points.as_slice() {
-            let crossing = hermite(*end, (end - before).normalize(), centre[0], (centre[1] - centre[0]).normalize());
-            legs.extend(std::iter::repeat_n(index, crossing.len()));
-            points.extend(crossing);
+            if (centre[0] - end).norm() < SEAMLESS_M {
+                centre.remove(0);
+                offsets_m.remove(0);
+            } else {
+                let (leaving, arriving) = ((end - before).normalize(), (centre[1] - centre[0]).normalize());
+                let crossing = hermite(*end, leaving, centre[0], arriving);
+                lanes.extend(std::iter::repeat_n(place(offsets_m[0]), crossing.len()));
+                points.extend(crossing);
+            }
         }
-        legs.extend(std::iter::repeat_n(index, centre.len()));
+        lanes.extend(offsets_m.into_iter().map(place));
         points.extend(centre);
     }
-    (points, legs)
+    (points, lanes)
 }
 
-fn lane_centre(network: &RoadNetwork, leg: &Leg) -> Vec<Point2<f64>> {
-    let reference = &network.link(leg.link).reference;
-    let offset_m = |lane: u8| (f64::from(lane) + 0.5) * LANE_WIDTH_M;
-    let change_from_m = 0.5 * (reference.len() as f64 - LANE_CHANGE_M);
+/// The centre of the lane driven along a link, and how far it lies to the right of the reference line.
+fn lane_centre(network: &RoadNetwork, leg: &Leg) -> (Vec<Point2<f64>>, Vec<f64>) {
+    let link = network.link(leg.link);
+    let reference = &link.reference;
+    let offset_m = |lane: u8| (f64::from(lane) + 0.5) * link.lane_width_m;
     let to_the_right = if leg.forward { -1.0 } else { 1.0 };
     (0..reference.len())
         .map(|k| {
-            let share = smooth_step((k as f64 - change_from_m) / LANE_CHANGE_M);
-            let from_reference_m = offset_m(leg.lane) + (offset_m(leg.end_lane) - offset_m(leg.lane)) * share;
+            let (mut lane_m, mut lane) = (offset_m(leg.lane), leg.lane);
+            for change in &leg.changes {
+                let share = smooth_step((k as f64 - change.from_m) / LANE_CHANGE_M);
+                lane_m += (offset_m(change.lane) - offset_m(lane)) * share;
+                lane = change.lane;
+            }
             let index = if leg.forward { k } else { reference.len() - 1 - k };
-            reference.offset_point(index, to_the_right * from_reference_m)
+            (reference.offset_point(index, to_the_right * lane_m), lane_m)
         })
-        .collect()
+        .unzip()
 }
 
 /// Points strictly between two ends on the cubic that leaves and arrives in the given directions.

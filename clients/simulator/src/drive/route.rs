@@ -7,11 +7,13 @@ use crate::{
 
 /// Probability that a vehicle goes straight on where it can.
 const STRAIGHT_ON: f64 = 0.55;
+/// Length of a lane change, metres.
+pub const LANE_CHANGE_M: f64 = 70.0;
 /// Probability of a lane change within a link that has room for one.
 const LANE_CHANGE: f64 = 0.3;
 
 /// One link of a route.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Leg {
     /// The link.
     pub link: LinkIndex,
@@ -19,8 +21,25 @@ pub struct Leg {
     pub forward: bool,
     /// Lane at the start of the link, counted from the reference line.
     pub lane: u8,
-    /// Lane at the end of the link; differs where the vehicle changes lanes.
-    pub end_lane: u8,
+    /// Changes of lane within the link, in the order in which they are driven.
+    pub changes: Vec<LaneChange>,
+}
+
+/// A change of lane within a link.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LaneChange {
+    /// Where it begins, metres from the link's beginning in the direction of travel.
+    pub from_m: f64,
+    /// The lane that it leads to, counted from the reference line.
+    pub lane: u8,
+}
+
+impl Leg {
+    /// Lane at the end of the link.
+    #[must_use]
+    pub fn end_lane(&self) -> u8 {
+        self.changes.last().map_or(self.lane, |change| change.lane)
+    }
 }
 
 /// Links in the order in which they are driven.
@@ -73,7 +92,9 @@ fn leg(network: &RoadNetwork, link: LinkIndex, forward: bool, rng: &mut SimRng) 
     let pick = |rng: &mut SimRng| u8::try_from(choose(rng, usize::from(lanes))).unwrap_or(0);
     let lane = pick(rng);
     let end_lane = if happens(rng, LANE_CHANGE) { pick(rng) } else { lane };
-    Leg { link, forward, lane, end_lane }
+    let middle_m = 0.5 * (network.link(link).reference.len() as f64 - LANE_CHANGE_M);
+    let changes = if end_lane == lane { Vec::new() } else { vec![LaneChange { from_m: middle_m, lane: end_lane }] };
+    Leg { link, forward, lane, changes }
 }
 
 fn next_link(

@@ -81,6 +81,11 @@ pub struct PaintedLine {
 }
 
 impl PaintedLine {
+    /// A line at one offset from `from_m` to `to_m` along its road.
+    pub(crate) fn new(category: Category, offset_m: f64, from_m: f64, to_m: f64) -> Self {
+        Self { category, offset_m, moved_by: None, from_m, to_m }
+    }
+
     /// Offset at a distance along the link, or `None` where it is not painted.
     #[must_use]
     pub fn offset_at_m(&self, s_m: f64) -> Option<f64> {

@@ -6,7 +6,7 @@ use nalgebra::{Point2, Point3};
 use crate::{
     random::{Purpose, Seed},
     road::{
-        cross_section::{Carriageway, choose_extra_lane, paint},
+        cross_section::{Carriageway, LANE_WIDTH_M, choose_extra_lane, paint},
         plan::{NetworkPlan, PlannedLink},
         reference_line::ReferenceLine,
         terrain::Terrain,
@@ -44,8 +44,42 @@ pub struct Link {
     pub reference: ReferenceLine,
     /// Lanes and their directions.
     pub carriageway: Carriageway,
-    /// Lines of this link, from left to right.
+    /// Width of its lanes, metres.
+    pub lane_width_m: f64,
+    /// What kind of road it is.
+    pub kind: LinkKind,
+    /// Lines of this link; a line that runs on over several links is named by each of them.
     pub lines: Vec<RoadLineId>,
+}
+
+/// What kind of road a link is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LinkKind {
+    /// A street or road like any other.
+    Street,
+    /// A part of a roundabout's ring, between two of its arms.
+    Ring,
+    /// A part of a motorway's carriageway, with an extra lane on the right at its ends where ramps join or leave.
+    Motorway {
+        /// A ramp comes in at its beginning.
+        ramp_joins: bool,
+        /// A ramp goes off at its end.
+        ramp_leaves: bool,
+    },
+    /// A ramp between a motorway and another road.
+    Ramp,
+}
+
+impl LinkKind {
+    /// How much faster than in a street one drives here.
+    #[must_use]
+    pub fn speed_scale(self) -> f64 {
+        match self {
+            Self::Street | Self::Ring => 1.0,
+            Self::Ramp => 1.4,
+            Self::Motorway { .. } => 2.0,
+        }
+    }
 }
 
 /// A painted line or a curb in space.
@@ -57,6 +91,17 @@ pub struct RoadLine {
     pub category: Category,
     /// Points about one metre apart, in the direction of the link's reference line, world frame, metres.
     pub points: Vec<Point3<f64>>,
+}
+
+impl RoadLine {
+    /// Whether it comes back to where it begins.
+    #[must_use]
+    pub fn is_closed(&self) -> bool {
+        match self.points.as_slice() {
+            [first, .., last] => (first - last).norm() < 1e-6,
+            _ => false,
+        }
+    }
 }
 
 /// Roads on hilly land. World frame: east, north, up, metres.
@@ -92,9 +137,49 @@ impl RoadNetwork {
             let lines = network.lines[first..].iter().map(|line| line.id).collect();
             network.junctions[link.from].links.push(index);
             network.junctions[link.to].links.push(index);
-            network.links.push(Link { from: link.from, to: link.to, reference, carriageway: link.carriageway, lines });
+            network.links.push(Link {
+                from: link.from,
+                to: link.to,
+                reference,
+                carriageway: link.carriageway,
+                lane_width_m: LANE_WIDTH_M,
+                kind: LinkKind::Street,
+                lines,
+            });
         }
         network
+    }
+
+    /// A network without any road yet.
+    #[must_use]
+    pub(crate) fn on(terrain: Terrain) -> Self {
+        Self { terrain, junctions: Vec::new(), links: Vec::new(), lines: Vec::new() }
+    }
+
+    /// Adds a junction; gives its index.
+    pub(crate) fn add_junction(&mut self, place: Point2<f64>) -> usize {
+        self.junctions.push(Junction { place, links: Vec::new() });
+        self.junctions.len() - 1
+    }
+
+    /// Adds a line through places in plan, which come to lie on the land.
+    pub(crate) fn add_line(&mut self, category: Category, places: &[Point2<f64>]) -> RoadLineId {
+        let id = RoadLineId(u32::try_from(self.lines.len()).unwrap_or(u32::MAX));
+        let on_land = |place: &Point2<f64>| Point3::new(place.x, place.y, self.terrain.height_m(place));
+        self.lines.push(RoadLine { id, category, points: places.iter().map(on_land).collect() });
+        id
+    }
+
+    /// Adds a link; its junctions and lines are there already.
+    pub(crate) fn add_link(&mut self, link: Link) -> LinkIndex {
+        let index = LinkIndex(self.links.len());
+        for junction in [link.from, link.to] {
+            if !self.junctions[junction].links.contains(&index) {
+                self.junctions[junction].links.push(index);
+            }
+        }
+        self.links.push(link);
+        index
     }
 
     /// The land.

@@ -57,6 +57,28 @@ impl ReferenceLine {
         Self { points, headings_rad }
     }
 
+    /// The closed line through points, of which the last is the first again.
+    #[must_use]
+    pub(crate) fn closed_through(dense: &[Point2<f64>]) -> Self {
+        let mut line = Self::through(dense);
+        let last = line.points.len() - 1;
+        line.points[last] = line.points[0];
+        // At the seam as anywhere else: from the point before to the point after.
+        let across = line.points[1] - line.points[last - 1];
+        let seam_rad = across.y.atan2(across.x);
+        line.headings_rad[0] = line.headings_rad[1] + wrap(seam_rad - line.headings_rad[1]);
+        line.headings_rad[last] = line.headings_rad[last - 1] + wrap(seam_rad - line.headings_rad[last - 1]);
+        line
+    }
+
+    /// Places beside the line, one per point of it, where `offset_at_m` gives an offset to the left at a distance.
+    #[must_use]
+    pub(crate) fn offset_line(&self, offset_at_m: impl Fn(f64) -> Option<f64>) -> Vec<Point2<f64>> {
+        let length_m = self.length_m();
+        let at_m = |k: usize| (k as f64 / (self.len() - 1) as f64 * length_m).min(length_m);
+        (0..self.len()).filter_map(|k| Some(self.offset_point(k, offset_at_m(at_m(k))?))).collect()
+    }
+
     /// Length, metres.
     #[must_use]
     pub fn length_m(&self) -> f64 {

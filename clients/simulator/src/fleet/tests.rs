@@ -1,0 +1,116 @@
+//! Promises of fleets.
+
+use lanemap_core::Frame;
+use nalgebra::Vector3;
+
+use super::*;
+
+fn road(drives: u32) -> FleetScenario {
+    let routes = FleetRoutes::Shared { length_m: 250.0, both_directions: true };
+    FleetScenario { drives, routes, ..FleetScenario::winding_road() }
+}
+
+fn bytes(fleet: &Fleet) -> Vec<Vec<u8>> {
+    let frames = |drive: FleetDrive<'_>| drive.frames().map(|frame| frame.to_bytes().unwrap()).collect::<Vec<_>>();
+    fleet.drives().flat_map(frames).collect()
+}
+
+#[test]
+fn one_seed_gives_the_same_bytes_and_another_seed_others() {
+    assert_eq!(bytes(&road(2).fleet(Seed(1))), bytes(&road(2).fleet(Seed(1))));
+    assert_ne!(bytes(&road(2).fleet(Seed(1))), bytes(&road(2).fleet(Seed(2))));
+}
+
+#[test]
+fn a_drive_is_the_same_whoever_drives_beside_it() {
+    let (few, many) = (road(2).fleet(Seed(1)), road(5).fleet(Seed(1)));
+    assert!(few.drive(1).frames().eq(many.drive(1).frames()));
+}
+
+#[test]
+fn drives_start_one_after_the_other_and_their_frames_are_ten_a_second() {
+    let fleet = road(3).fleet(Seed(1));
+    let mut before = TimestampNs(0);
+    for drive in fleet.drives() {
+        let frames: Vec<Frame> = drive.frames().collect();
+        assert!(frames.len() > 150);
+        assert!(frames[0].time() > before, "drive {}", drive.number());
+        assert!(frames.windows(2).all(|pair| pair[1].time().0 - pair[0].time().0 == 100_000_000));
+        before = frames[frames.len() - 1].time();
+    }
+}
+
+#[test]
+fn drives_of_one_road_go_both_ways_and_see_the_same_lines() {
+    let fleet = road(2).fleet(Seed(3));
+    let forward: Vec<bool> = fleet.drives().map(|drive| drive.route().legs[0].forward).collect();
+    assert_eq!(forward, [true, false]);
+    for drive in fleet.drives() {
+        let seen = drive.observed().filter(|observed| observed.views.len() >= 3).count();
+        assert!(seen * 10 > drive.states().len() * 8, "{seen} of {}", drive.states().len());
+    }
+}
+
+#[test]
+fn fixes_lie_about_the_true_place_by_the_drives_own_bias() {
+    let fleet = road(2).fleet(Seed(1));
+    let (on_earth, model) = (fleet.georeference(), fleet.scenario().receiver);
+    for drive in fleet.drives() {
+        let truth = drive.states().iter().map(|state| state.world_from_vehicle.translation.vector);
+        let errors: Vec<Vector3<f64>> = drive
+            .frames()
+            .zip(truth)
+            .map(|(frame, place)| {
+                let fix = frame.gnss().unwrap();
+                let on_the_earth =
+                    Wgs84 { latitude_deg: fix.latitude_deg, longitude_deg: fix.longitude_deg, height_m: fix.height_m };
+                on_earth.to_map(&on_the_earth).coords - place
+            })
+            .collect();
+        let mean = errors.iter().sum::<Vector3<f64>>() / errors.len() as f64;
+        assert!(mean.norm() < 4.0 * 2.0 * model.bias_sigma_m);
+        for error in errors {
+            assert!((error - mean).norm() < 1.2, "{}", (error - mean).norm());
+        }
+    }
+}
+
+#[test]
+fn a_loop_comes_back_to_where_it_began_and_its_odometry_does_not() {
+    let fleet = FleetScenario::closed_loop().fleet(Seed(2));
+    let drive = fleet.drive(0);
+    let states = drive.states();
+    let first = states[0].world_from_vehicle.translation.vector;
+    let again = states.iter().filter(|state| state.distance_m > 1_000.0).min_by(|a, b| {
+        let distance = |state: &crate::drive::TrueState| (state.world_from_vehicle.translation.vector - first).norm();
+        distance(a).total_cmp(&distance(b))
+    });
+    let again = again.unwrap();
+    assert!((again.world_from_vehicle.translation.vector - first).xy().norm() < 8.0);
+    assert!((again.distance_m - 2_000.0).abs() < 80.0, "{}", again.distance_m);
+    let index = states.iter().position(|state| state.time == again.time).unwrap();
+    let believed = drive.frames().nth(index).unwrap().odometry().odometry_from_vehicle;
+    let drift_m =
+        (drive.world_from_odometry() * believed).translation.vector - again.world_from_vehicle.translation.vector;
+    assert!(drift_m.norm() > 1.0 && drift_m.norm() < 100.0, "{}", drift_m.norm());
+    // Across the seam lines go on being seen.
+    let seam = drive.observed().skip(index - 60).take(120);
+    assert!(seam.filter(|observed| observed.views.len() >= 3).count() > 110);
+}
+
+#[test]
+fn a_poisoned_fleet_has_its_share_of_drives_with_errors_and_the_rest_is_as_before() {
+    let poison = PoisonPlan { gross_share: 0.3, adversarial_share: 0.1 };
+    let (clean, poisoned) = (road(12).fleet(Seed(4)), FleetScenario { poison, ..road(12) }.fleet(Seed(4)));
+    let mut kinds = std::collections::BTreeSet::new();
+    for (a, b) in clean.drives().zip(poisoned.drives()) {
+        match b.poison() {
+            None => assert!(a.frames().eq(b.frames())),
+            Some(poison) => {
+                assert!(!a.frames().eq(b.frames()));
+                kinds.insert(format!("{poison:?}").split(['(', ' ']).next().unwrap().to_owned());
+            }
+        }
+    }
+    assert!(kinds.len() >= 2, "{kinds:?}");
+}

@@ -1,17 +1,20 @@
 //! The actor of one session: the only owner of the drive's mapper.
 //!
-//! It gathers the frames that are waiting, puts them in order (`intake`), makes them durable in one commit, acks them, maps
-//! them, and sends poses back. It publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
+//! It gathers the frames that are waiting, puts them in order (`intake`), makes them durable in one commit and acks them.
+//! Acked frames wait (`backlog`) until it is the session's turn at mapping, while others are taken and acked: an ack waits
+//! for the disk and for nothing else. Poses go back as frames are mapped. The actor publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
 //! snapshot every so many frames, when the drive ends, and before it leaves memory.
 
+mod backlog;
 mod command;
 mod intake;
+mod mapping;
 mod updates;
 
 use std::{sync::Arc, time::Duration};
 
-use lanemap_core::{Frame, Sequence};
-use lanemap_proto::v1::{self, stream_observations_response::Message};
+use lanemap_core::Sequence;
+use lanemap_proto::v1;
 use tokio::{
     sync::mpsc,
     time::{Instant, sleep_until},
@@ -25,7 +28,7 @@ use super::{
     in_flight::InFlightBudget,
     mapping_turns::MappingTurns,
     published::state_without_stream,
-    registry::{self, blocking},
+    registry,
     reorder::Reorder,
 };
 use crate::{
@@ -36,12 +39,10 @@ use crate::{
     privacy::Pseudonyms,
     telemetry,
 };
+use backlog::Backlog;
 pub(crate) use command::{Arrival, Attach, Attached, Command, StreamNumber};
 use intake::Early;
-use updates::{local_map_update, pose_update};
 
-/// Time of mapping between two chances for other tasks to run.
-const LONGEST_RUN: Duration = Duration::from_millis(1);
 /// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
 
@@ -65,6 +66,7 @@ pub(crate) struct Actor {
     /// The actors that are running, this one among them.
     actors: TaskTracker,
     mapping_turns: MappingTurns,
+    backlog: Backlog,
     stream: Option<Stream>,
     unpublished: bool,
     next_publication: Instant,
@@ -143,6 +145,7 @@ impl Actor {
             reorder,
             commands,
             actors,
+            backlog: Backlog::new(mapping_turns.clone()),
             mapping_turns,
             stream: None,
             unpublished: false,
@@ -195,9 +198,15 @@ impl Actor {
                 Some(command) => self.take(command).await?,
                 None => return Ok(false),
             },
+            turn = self.backlog.turn() => {
+                self.map_for(turn).await;
+                if self.backlog.is_empty() && self.snapshot_is_due() {
+                    self.save().await?;
+                }
+            }
             () = sleep_until(self.next_publication), if self.unpublished => self.publish(),
             () = sleep_until_some(overdue) => self.give_up_overdue().await?,
-            () = cancelled(gone) => self.detach(Ok(())),
+            () = cancelled(gone) => self.detach(Ok(())).await,
             () = sleep_until(self.unload_at), if detached => {
                 // Frames are held no longer than a trip pauses.
                 self.end_trip();
@@ -225,7 +234,7 @@ impl Actor {
                 }
                 Command::Attach(attach) => {
                     self.commit(&mut batch).await?;
-                    self.attach(attach);
+                    self.attach(attach).await;
                 }
                 Command::End { stream } => {
                     if self.is_current(stream) {
@@ -243,7 +252,7 @@ impl Actor {
                     }
                     self.commit(&mut batch).await?;
                     if self.is_current(stream) {
-                        self.detach(with);
+                        self.detach(with).await;
                     }
                 }
             }
@@ -259,11 +268,13 @@ impl Actor {
         self.stream.as_ref().is_some_and(|current| current.number == stream)
     }
 
-    fn attach(&mut self, attach: Attach) {
+    async fn attach(&mut self, attach: Attach) {
         if self.leaving {
             // Its sender sees that it was dropped, and starts the next actor.
             return;
         }
+        // Their poses are the stream's before.
+        self.map_all_acked().await;
         if let Some(before) = self.stream.take() {
             before.outbox.finish(Err(Error::Superseded.into()));
         }
@@ -271,7 +282,7 @@ impl Actor {
         self.reorder.restart(self.drive.last_sequence());
         let attached = Attached { last: self.drive.last_sequence(), ended: self.record.ended };
         if attach.attached.send(attached).is_err() {
-            return self.detach(Ok(()));
+            return self.detach(Ok(())).await;
         }
         self.stream = Some(Stream {
             number: attach.stream,
@@ -282,7 +293,8 @@ impl Actor {
         self.publish();
     }
 
-    fn detach(&mut self, with: Result<(), Status>) {
+    async fn detach(&mut self, with: Result<(), Status>) {
+        self.map_all_acked().await;
         let stream = self.stream.take();
         self.reorder.restart(self.drive.last_sequence());
         self.unload_at = self.unload_time();
@@ -311,7 +323,7 @@ impl Actor {
         self.stream.as_ref().is_some_and(|stream| stream.outbox.is_closed())
     }
 
-    /// Makes the batch durable, acks it, maps it.
+    /// Makes the batch durable, acks it, and has it wait to be mapped.
     async fn commit(&mut self, batch: &mut Batch) -> Outcome {
         let Batch { frames, journal, repeated, cut } = std::mem::take(batch);
         if cut > 0 {
@@ -323,7 +335,8 @@ impl Actor {
             }
             return Ok(());
         }
-        self.surroundings.journal.append(self.record.id, journal).await?;
+        let (store, session) = (self.surroundings.journal.clone(), self.record.id);
+        self.mapping_meanwhile(store.append(session, journal)).await?;
         self.ack();
         for arrival in &frames {
             metrics::histogram!(telemetry::ACK_SECONDS).record(arrival.arrived.elapsed().as_secs_f64());
@@ -332,11 +345,12 @@ impl Actor {
         self.frames_since_snapshot += frames.len() as u64;
         if self.drive.holds_back() {
             let ready = self.ready_frames().await?;
-            self.map_all(ready.iter()).await;
+            self.map_held_back(&ready).await;
         } else {
-            self.map_all(frames.iter().map(|arrival| &arrival.frame)).await;
+            self.backlog.extend(frames);
         }
-        if self.frames_since_snapshot >= self.surroundings.config.snapshot_every_frames {
+        // Where mapping never catches up, a snapshot that is long due waits for it here.
+        if self.drive.holds_back() && self.snapshot_is_due() || self.snapshot_is_overdue() {
             self.save().await?;
         }
         Ok(())
@@ -355,25 +369,12 @@ impl Actor {
         Ok(())
     }
 
-    /// The frames that were held back until now.
-    async fn ready_frames(&self) -> Result<Vec<Frame>, JournalError> {
-        let Some(through) = self.drive.ready() else { return Ok(Vec::new()) };
-        let (journal, session, covered) = (self.surroundings.journal.clone(), self.record.id, self.drive.covered());
-        blocking(move || journal.frames_between(session, covered, through)?.collect()).await
+    fn snapshot_is_due(&self) -> bool {
+        self.frames_since_snapshot >= self.surroundings.config.snapshot_every_frames
     }
 
-    async fn map_all(&mut self, frames: impl Iterator<Item = &Frame>) {
-        let turns = self.mapping_turns.clone();
-        let (mut turn, mut began) = (turns.take().await, Instant::now());
-        for frame in frames {
-            self.map(frame);
-            if began.elapsed() >= LONGEST_RUN {
-                drop(turn);
-                tokio::task::yield_now().await;
-                (turn, began) = (turns.take().await, Instant::now());
-            }
-        }
-        drop(turn);
+    fn snapshot_is_overdue(&self) -> bool {
+        self.frames_since_snapshot / 2 >= self.surroundings.config.snapshot_every_frames
     }
 
     fn ack(&self) {
@@ -382,23 +383,12 @@ impl Actor {
         }
     }
 
-    fn map(&mut self, frame: &Frame) {
-        let started = Instant::now();
-        let report = self.drive.map(frame);
-        metrics::histogram!(telemetry::STEP_SECONDS).record(started.elapsed().as_secs_f64());
-        self.unpublished = true;
-        let Some(stream) = &self.stream else { return };
-        stream.outbox.update(Message::Pose(pose_update(&report)));
-        if stream.wants_local_map {
-            stream.outbox.update(Message::LocalMap(local_map_update(&report, &self.drive)));
-        }
-    }
-
     /// Ends the drive: its state is saved, and no frame is taken any more.
     async fn end(&mut self, stream: StreamNumber) -> Outcome {
         if !self.is_current(stream) {
             return Ok(());
         }
+        self.map_all_acked().await;
         if !self.record.ended {
             // A crash between leaves a drive that the client ends again.
             self.end_trip();
@@ -411,12 +401,13 @@ impl Actor {
         if let Some(stream) = &self.stream {
             stream.outbox.end(v1::SessionEnded { acked_sequence_inclusive });
         }
-        self.detach(Ok(()));
+        self.detach(Ok(())).await;
         Ok(())
     }
 
     /// Saves the drive's state where it changed, and trims the journal.
     async fn save(&mut self) -> Outcome {
+        self.map_all_acked().await;
         let Some(covered) = self.drive.covered().filter(|_| self.frames_since_snapshot > 0) else {
             return Ok(());
         };

@@ -27,6 +27,8 @@ pub(crate) struct Drive {
     progress: Progress,
     cut: TripCut,
     ends: Ends,
+    /// The last frame that was mapped, where nothing is cut; admitted ones may still wait for it.
+    mapped: Option<(Sequence, TimestampNs)>,
 }
 
 /// What is cut off the ends of a drive's trips. Stands still where nothing is cut.
@@ -129,7 +131,7 @@ impl Drive {
     /// A drive that has had no frame.
     pub(crate) fn new(setup: &SessionSetup, cut: TripCut) -> Self {
         let mapper = Mapper::new(Params::preset(setup.preset), setup.sensor);
-        Self { mapper, progress: Progress::default(), cut, ends: Ends::default() }
+        Self { mapper, progress: Progress::default(), cut, ends: Ends::default(), mapped: None }
     }
 
     /// The drive of [`Drive::snapshot`]'s bytes.
@@ -137,7 +139,8 @@ impl Drive {
         let ((progress, mapper), rest): ((Progress, Vec<u8>), _) = postcard::take_from_bytes(bytes)?;
         // Snapshots of earlier builds end here.
         let ends = if rest.is_empty() { Ends::default() } else { postcard::from_bytes(rest)? };
-        Ok(Self { mapper: Mapper::restore(&mapper)?, progress, cut, ends })
+        let mapped = progress.last;
+        Ok(Self { mapper: Mapper::restore(&mapper)?, progress, cut, ends, mapped })
     }
 
     /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
@@ -213,6 +216,7 @@ impl Drive {
     /// Maps a frame that was admitted. Where frames are held back, those of [`Drive::ready`], in their order.
     pub(crate) fn map(&mut self, frame: &Frame) -> StepReport {
         self.progress.mapped += 1;
+        self.mapped = Some((frame.sequence(), frame.time()));
         if self.cut.is_on() {
             self.ends.settled = Some(frame.sequence());
             self.ends.mapped = Some((frame.sequence(), frame.time()));
@@ -281,7 +285,7 @@ impl Drive {
 
     /// The last frame that readers may know of.
     fn last_shown(&self) -> Option<(Sequence, TimestampNs)> {
-        if self.cut.is_on() { self.ends.mapped } else { self.progress.last }
+        if self.cut.is_on() { self.ends.mapped } else { self.mapped }
     }
 
     /// What is told of the drive while it sleeps, as bytes; nothing where it is hidden.

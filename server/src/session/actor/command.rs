@@ -34,7 +34,6 @@ pub(crate) struct Arrival {
     pub(crate) frame: Frame,
     pub(crate) arrived: Instant,
     /// Held until the frame is mapped.
-    #[expect(dead_code, reason = "held, not read")]
     pub(crate) place: FramePlace,
 }
 

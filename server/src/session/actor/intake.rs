@@ -83,8 +83,8 @@ impl Actor {
         match passed {
             Passed::Frame(early) => self.admit(early, batch).await,
             Passed::Gap(missing) => {
-                if let Some(stream) = &self.stream {
-                    stream.outbox.gap(&missing).await;
+                if let Some(outbox) = self.stream.as_ref().map(|stream| stream.outbox.clone()) {
+                    self.mapping_meanwhile(outbox.gap(&missing)).await;
                 }
                 Ok(())
             }
@@ -100,9 +100,9 @@ impl Actor {
         Ok(())
     }
 
-    async fn refuse(&self, refusal: &Refusal) {
-        if let Some(stream) = &self.stream {
-            stream.outbox.refuse(refusal).await;
+    async fn refuse(&mut self, refusal: &Refusal) {
+        if let Some(outbox) = self.stream.as_ref().map(|stream| stream.outbox.clone()) {
+            self.mapping_meanwhile(outbox.refuse(refusal)).await;
         }
     }
 

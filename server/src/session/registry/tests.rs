@@ -1,0 +1,78 @@
+use std::path::Path;
+
+use futures::StreamExt;
+use lanemap_core::{FrameLimits, FrameParts, Odometry, Preset, Sensor, Sequence, TimestampNs, geometry::Pose};
+use lanemap_proto::v1::{self, stream_observations_response::Message};
+
+use super::*;
+use crate::{
+    config::ServerConfig,
+    ingest::{OutboxStream, decode::PointFrame},
+    journal::JournalOptions,
+    session::{SessionSetup, Sessions, in_flight::InFlightBudget},
+};
+
+/// No session yet, and a store in `folder`.
+async fn registry(folder: &Path, config: ServerConfig) -> SessionRegistry {
+    let (journal, _) = Journal::open(&JournalOptions::new(folder)).unwrap();
+    let surroundings = Surroundings {
+        journal,
+        pseudonyms: Pseudonyms::open(&folder.join("key"), None).unwrap(),
+        sessions: Sessions::new(1 << 20),
+        in_flight: InFlightBudget::new(&config),
+        shutdown: CancellationToken::new(),
+        config: Arc::new(config),
+    };
+    SessionRegistry::recover(surroundings).await.unwrap()
+}
+
+fn start() -> Start {
+    let key = SessionKey { fleet: "fleet".to_owned(), vehicle: "vehicle".to_owned(), drive: "drive".to_owned() };
+    let setup = SessionSetup { preset: Preset::Default, sensor: Sensor::default() };
+    Start { key, setup, point_frame: PointFrame::Vehicle, wants_local_map: false }
+}
+
+fn frame(number: u64) -> Frame {
+    let odometry = Odometry { odometry_from_vehicle: Pose::identity(), motion_covariance: None };
+    let time = TimestampNs(i64::try_from(number).unwrap() * 100_000_000);
+    let parts =
+        FrameParts { sequence: Sequence(number), time, odometry, gnss: None, detections: vec![], occlusions: vec![] };
+    Frame::new(parts, &FrameLimits::default()).unwrap()
+}
+
+async fn next(answers: &mut OutboxStream) -> Message {
+    answers.next().await.unwrap().unwrap().message.unwrap()
+}
+
+#[tokio::test]
+async fn an_ack_does_not_wait_for_mapping_and_no_more_wait_for_it_than_may_be_in_flight() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = ServerConfig { max_frames_in_flight: 3, ..ServerConfig::default() };
+    let registry = registry(folder.path(), config).await;
+    let (outbox, mut answers) = Outbox::new();
+    let attachment = registry.open(&start(), &outbox).await.unwrap();
+    // Others map, and go on mapping.
+    let mut others = Vec::new();
+    for _ in 0..cores() {
+        others.push(registry.shared.mapping_turns.take().await);
+    }
+    for number in 1..=3 {
+        attachment.send_frame(frame(number), Instant::now()).await.unwrap();
+        assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: number }));
+    }
+    // Three acked frames are in flight still: the next one is not taken, and the session's queue is not what stops it.
+    let mut fourth = Box::pin(attachment.send_frame(frame(4), Instant::now()));
+    assert!(futures::poll!(fourth.as_mut()).is_pending());
+    drop(others);
+    fourth.await.unwrap();
+    let mut poses = Vec::new();
+    let mut acked = 3;
+    while poses.len() < 4 {
+        match next(&mut answers).await {
+            Message::Pose(pose) => poses.push(pose.sequence),
+            Message::Ack(ack) => acked = ack.acked_sequence_inclusive,
+            other => panic!("{other:?}"),
+        }
+    }
+    assert_eq!((poses, acked), (vec![1, 2, 3, 4], 4));
+}

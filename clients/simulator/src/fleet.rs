@@ -33,7 +33,7 @@ use crate::{
     detector::DetectorModel,
     drive::MotionModel,
     random::{Purpose, Seed},
-    road::{Course, RoadNetwork, SingleRoad},
+    road::{Course, RoadNetwork, SingleRoad, TownPlan},
 };
 
 pub use canyon::Canyon;
@@ -56,6 +56,8 @@ const TURIN: Wgs84 = Wgs84 { latitude_deg: 45.0628, longitude_deg: 7.6688, heigh
 pub enum FleetRoads {
     /// One road without junctions.
     Single(SingleRoad),
+    /// A town.
+    Town(TownPlan),
 }
 
 /// What to simulate.
@@ -136,11 +138,32 @@ impl FleetScenario {
         }
     }
 
+    /// Drives of 1 km each way through a town of about 10 km^2, four a day.
+    #[must_use]
+    pub fn town(drives: u32) -> Self {
+        Self {
+            roads: FleetRoads::Town(TownPlan::square_km(3.2)),
+            max_grade: 0.03,
+            drives,
+            interval_ns: DAY_NS / 4,
+            routes: FleetRoutes::Random { length_m: 1_000.0 },
+            canyon_share: 0.15,
+            ..Self::on_road(Course::Straight)
+        }
+    }
+
+    /// The same on a town of about 2 km^2.
+    #[must_use]
+    pub fn small_town(drives: u32) -> Self {
+        Self { roads: FleetRoads::Town(TownPlan::small()), ..Self::town(drives) }
+    }
+
     /// Builds the world. The same scenario and seed give the same fleet, to the byte.
     #[must_use]
     pub fn fleet(self, seed: Seed) -> Fleet {
         let network = match &self.roads {
             FleetRoads::Single(road) => road.build(self.max_grade, seed),
+            FleetRoads::Town(plan) => plan.build(self.max_grade, seed),
         };
         let canyons = Canyon::scatter(&network, self.canyon_share, &mut seed.stream(Purpose::Canyons, 0));
         let on_earth = Georeference { anchor: Anchor::new(self.anchor), enu_from_map: Pose::identity() };

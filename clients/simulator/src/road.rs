@@ -7,6 +7,7 @@ pub mod plan;
 pub mod reference_line;
 pub mod single;
 pub mod terrain;
+pub mod town;
 
 pub use cross_section::{Carriageway, PaintedLine};
 pub use network::{Junction, Link, LinkIndex, LinkKind, RoadLine, RoadLineId, RoadNetwork};
@@ -14,3 +15,4 @@ pub use plan::NetworkPlan;
 pub use reference_line::ReferenceLine;
 pub use single::{Course, SingleRoad};
 pub use terrain::Terrain;
+pub use town::TownPlan;

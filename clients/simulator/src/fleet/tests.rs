@@ -114,3 +114,40 @@ fn a_poisoned_fleet_has_its_share_of_drives_with_errors_and_the_rest_is_as_befor
     }
     assert!(kinds.len() >= 2, "{kinds:?}");
 }
+
+#[test]
+fn drives_through_a_town_keep_to_its_roads_and_see_them() {
+    let fleet = FleetScenario::small_town(12).fleet(Seed(3));
+    let mut with_lines = 0;
+    let mut frames = 0;
+    for drive in fleet.drives() {
+        assert!(drive.length_m() > 990.0, "{}", drive.length_m());
+        for pair in drive.states().windows(2) {
+            let motion = pair[0].world_from_vehicle.inverse() * pair[1].world_from_vehicle;
+            let (ahead_m, aside_m) = (motion.translation.x, motion.translation.y.abs());
+            assert!((0.2..3.2).contains(&ahead_m) && aside_m < 0.12 * ahead_m, "{ahead_m} {aside_m}");
+        }
+        for observed in drive.observed() {
+            frames += 1;
+            with_lines += usize::from(observed.views.len() >= 2);
+        }
+    }
+    assert!(with_lines * 10 > frames * 7, "{with_lines} of {frames}");
+}
+
+#[test]
+fn a_canyon_in_town_shifts_fixes_by_metres() {
+    let fleet = FleetScenario { canyon_share: 1.0, ..FleetScenario::small_town(6) }.fleet(Seed(3));
+    assert!(fleet.canyons().len() > 15);
+    let mut jumps = 0;
+    for drive in fleet.drives() {
+        let errors: Vec<Vector3<f64>> = drive
+            .observed()
+            .map(|seen| {
+                seen.gnss_world_from_vehicle.translation.vector - seen.truth.world_from_vehicle.translation.vector
+            })
+            .collect();
+        jumps += errors.windows(2).filter(|pair| (pair[1] - pair[0]).norm() > 2.0).count();
+    }
+    assert!(jumps >= 12, "{jumps}");
+}

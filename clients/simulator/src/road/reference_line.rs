@@ -71,6 +71,12 @@ impl ReferenceLine {
         line
     }
 
+    /// The part between two points, by their indices.
+    #[must_use]
+    pub(crate) fn slice(&self, points: std::ops::Range<usize>) -> Self {
+        Self { points: self.points[points.clone()].to_vec(), headings_rad: self.headings_rad[points].to_vec() }
+    }
+
     /// Places beside the line, one per point of it, where `offset_at_m` gives an offset to the left at a distance.
     #[must_use]
     pub(crate) fn offset_line(&self, offset_at_m: impl Fn(f64) -> Option<f64>) -> Vec<Point2<f64>> {

@@ -11,21 +11,25 @@
 //! 5. [`line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
 
 pub mod alignment;
+pub mod base;
 pub mod contribution;
 pub mod correction;
 pub mod fusion;
+mod growth;
 pub mod line;
 pub mod matching;
 pub mod params;
 mod persistence;
 pub mod placement;
 mod prepared;
+mod shown;
 mod sparse;
 pub mod trace;
 
+pub use base::Base;
 pub use contribution::{Contribution, DriveId, TrajectoryPoint};
 pub use correction::Correction;
-pub use fusion::{FusedDrive, FusedMap, fuse};
+pub use fusion::{FusedDrive, FusedMap, by_seniority, fold, fuse, fuse_onto, split_to_fold};
 pub use line::{FusedLane, FusedLaneId, FusedPoint};
 pub use params::FleetParams;
 pub use trace::Trace;

@@ -7,7 +7,7 @@
 //! * `|C(p) + b - g|^2 / s_g^2 + |b|^2 / s_b^2`: fixes `g`, and their bias `b`, which is a drive's own,
 //! * `rho(n . C(p) - mu) / s^2`: a lane's sample against the station `mu` of its line, along the line's normal `n`.
 //!
-//! `rho` is Geman and McClure's, whose weight is `(c^2 / (c^2 + r^2))^2`. Heights are a problem of their own, with one unknown per knot:
+//! `rho` is that of Geman and `McClure`, whose weight is `(c^2 / (c^2 + r^2))^2`. Heights are a problem of their own, with one unknown per knot:
 //! to first order they do not depend on the rest. Gauss-Newton; the normal equations are sparse. Since every drive has a
 //! bias of its own and none is the truth, the map lies at the mean of what their receivers say, and its
 //! variance falls with their number.
@@ -16,7 +16,7 @@
 
 use nalgebra::{Point3, Vector2};
 
-use super::{correction::Correction, params::FleetParams, prepared::PreparedDrive, sparse::NormalEquations};
+use super::{correction::Correction, prepared::Restraints, sparse::NormalEquations};
 
 /// Where a sample should lie along its normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,6 +42,16 @@ pub(super) struct Sighting {
     pub(super) height_variance_m2: f64,
 }
 
+/// The residuals at which robust weights have fallen to a quarter, metres: large while drives do not yet lie where they
+/// belong, and smaller from step to step (graduated non-convexity).
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RobustScales {
+    /// Of sightings across; in height twice that.
+    pub(super) lanes_m: f64,
+    /// Of fixes, from the median of the drive's.
+    pub(super) fixes_m: f64,
+}
+
 /// Unknowns of a drive's horizontal problem: 3 per knot, and 2 of the bias.
 struct Layout {
     first: Vec<usize>,
@@ -55,19 +65,19 @@ const WEAK: f64 = 1e-9;
 
 /// Solves for the corrections of `drives` (as many corrections), with `stations` stations.
 pub(super) fn align(
-    drives: &[&PreparedDrive<'_>],
+    drives: &[&Restraints],
     corrections: &mut [Correction],
     sightings: &[Sighting],
     stations: usize,
-    params: &FleetParams,
+    scales: RobustScales,
 ) {
     for _ in 0..GAUSS_NEWTON_STEPS {
-        align_horizontally(drives, corrections, sightings, stations, params);
+        align_horizontally(drives, corrections, sightings, stations, scales);
     }
-    align_heights(drives, corrections, sightings, stations, params);
+    align_heights(drives, corrections, sightings, stations, scales);
 }
 
-/// Geman and McClure's weight of a residual.
+/// The weight that Geman and `McClure` give a residual.
 pub(super) fn robust_weight(residual_m: f64, scale_m: f64) -> f64 {
     let ratio = scale_m * scale_m / (scale_m * scale_m + residual_m * residual_m);
     ratio * ratio
@@ -107,18 +117,18 @@ fn row_across(
 }
 
 fn align_horizontally(
-    drives: &[&PreparedDrive<'_>],
+    drives: &[&Restraints],
     corrections: &mut [Correction],
     sightings: &[Sighting],
     stations: usize,
-    params: &FleetParams,
+    scales: RobustScales,
 ) {
     let layout = Layout::new(corrections, 3, 2, stations);
     let mut equations = NormalEquations::new(layout.unknowns, WEAK);
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
         let first = layout.first[index];
         add_odometry(&mut equations, first, drive, correction);
-        add_fixes(&mut equations, first, drive, correction, params);
+        add_fixes(&mut equations, first, drive, correction, scales.fixes_m);
     }
     // The scale of a residual against a station needs the station's place now: the mean of its sightings.
     let residuals = residuals_across(corrections, sightings, stations);
@@ -134,7 +144,7 @@ fn align_horizontally(
                 -place
             }
         };
-        let weight = robust_weight(residual, params.robust_scale_m) / sighting.lateral_variance_m2;
+        let weight = robust_weight(residual, scales.lanes_m) / sighting.lateral_variance_m2;
         equations.add(&row, value, weight);
     }
     let Some(step) = equations.solve() else { return };
@@ -147,7 +157,7 @@ fn align_horizontally(
     }
 }
 
-fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &PreparedDrive<'_>, correction: &Correction) {
+fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &Restraints, correction: &Correction) {
     for (index, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
         let (before, after) = (first + 3 * index, first + 3 * (index + 1));
         let predicted = pair[0].apply(&pair[1].map);
@@ -164,23 +174,20 @@ fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &PreparedD
 fn add_fixes(
     equations: &mut NormalEquations,
     first: usize,
-    drive: &PreparedDrive<'_>,
+    drive: &Restraints,
     correction: &Correction,
-    params: &FleetParams,
+    robust_scale_m: f64,
 ) {
-    let Some(last) = drive.fixes.last() else { return };
+    if drive.fixes.is_empty() {
+        return;
+    }
     let bias = first + 3 * correction.knots.len();
-    let length_m = last.arc_m - drive.fixes[0].arc_m;
-    let deflation =
-        (drive.fixes.len() as f64 * params.gnss_correlation_m / (length_m + params.gnss_correlation_m)).max(1.0);
-    let mean_sigma_m = drive.fixes.iter().map(|fix| fix.horizontal_sigma_m).sum::<f64>() / drive.fixes.len() as f64;
-    let bias_sigma_m = mean_sigma_m.max(params.gnss_bias_sigma_m);
     let offsets: Vec<Vector2<f64>> =
         drive.fixes.iter().map(|fix| (fix.shared - correction.apply(&fix.map, fix.arc_m)).xy()).collect();
     let common = median(&offsets);
     for (fix, offset) in drive.fixes.iter().zip(&offsets) {
-        let sigma_m = params.gnss_shape_share * fix.horizontal_sigma_m;
-        let weight = robust_weight((offset - common).norm(), 4.0 * sigma_m) / (sigma_m * sigma_m * deflation);
+        let [sigma_m, _] = fix.sigma_m;
+        let weight = robust_weight((offset - common).norm(), robust_scale_m) / (sigma_m * sigma_m);
         for (axis, bias, value) in [(Vector2::x(), bias, offset.x), (Vector2::y(), bias + 1, offset.y)] {
             let mut row = row_across(first, correction, &fix.map, fix.arc_m, &axis);
             row.push((bias, 1.0));
@@ -188,7 +195,7 @@ fn add_fixes(
         }
     }
     for unknown in [bias, bias + 1] {
-        equations.add(&[(unknown, 1.0)], 0.0, bias_sigma_m.powi(-2));
+        equations.add(&[(unknown, 1.0)], 0.0, drive.bias_sigma_m[0].powi(-2));
     }
 }
 
@@ -233,11 +240,11 @@ fn residuals(places: &[f64], targets: impl Iterator<Item = Target> + Clone, stat
 }
 
 fn align_heights(
-    drives: &[&PreparedDrive<'_>],
+    drives: &[&Restraints],
     corrections: &mut [Correction],
     sightings: &[Sighting],
     stations: usize,
-    params: &FleetParams,
+    scales: RobustScales,
 ) {
     let layout = Layout::new(corrections, 1, 1, stations);
     let mut equations = NormalEquations::new(layout.unknowns, WEAK);
@@ -247,7 +254,7 @@ fn align_heights(
             let residual = (pair[1].shared.z - pair[0].shared.z) - (pair[1].map.z - pair[0].map.z);
             equations.add(&[(first + knot + 1, 1.0), (first + knot, -1.0)], -residual, 1.0 / step.height_m2);
         }
-        add_fixed_heights(&mut equations, first, drive, correction, params);
+        add_fixed_heights(&mut equations, first, drive, correction);
     }
     let places: Vec<f64> =
         sightings.iter().map(|sighting| corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).z).collect();
@@ -261,7 +268,7 @@ fn align_heights(
                 -place
             }
         };
-        let weight = robust_weight(residual, 2.0 * params.robust_scale_m) / sighting.height_variance_m2;
+        let weight = robust_weight(residual, 2.0 * scales.lanes_m) / sighting.height_variance_m2;
         equations.add(&row, value, weight);
     }
     let Some(step) = equations.solve() else { return };
@@ -281,25 +288,17 @@ fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Vec<(usiz
     row
 }
 
-fn add_fixed_heights(
-    equations: &mut NormalEquations,
-    first: usize,
-    drive: &PreparedDrive<'_>,
-    correction: &Correction,
-    params: &FleetParams,
-) {
-    let Some(last) = drive.fixes.last() else { return };
+fn add_fixed_heights(equations: &mut NormalEquations, first: usize, drive: &Restraints, correction: &Correction) {
+    if drive.fixes.is_empty() {
+        return;
+    }
     let bias = first + correction.knots.len();
-    let length_m = last.arc_m - drive.fixes[0].arc_m;
-    let deflation =
-        (drive.fixes.len() as f64 * params.gnss_correlation_m / (length_m + params.gnss_correlation_m)).max(1.0);
-    let mean_sigma_m = drive.fixes.iter().map(|fix| fix.vertical_sigma_m).sum::<f64>() / drive.fixes.len() as f64;
     for fix in &drive.fixes {
-        let sigma_m = params.gnss_shape_share * fix.vertical_sigma_m;
+        let [_, sigma_m] = fix.sigma_m;
         let mut row = row_of_height(first, correction, fix.arc_m);
         row.push((bias, 1.0));
         let offset = fix.shared.z - correction.apply(&fix.map, fix.arc_m).z;
-        equations.add(&row, offset, 1.0 / (sigma_m * sigma_m * deflation));
+        equations.add(&row, offset, 1.0 / (sigma_m * sigma_m));
     }
-    equations.add(&[(bias, 1.0)], 0.0, mean_sigma_m.max(params.gnss_bias_sigma_m).powi(-2));
+    equations.add(&[(bias, 1.0)], 0.0, drive.bias_sigma_m[1].powi(-2));
 }

@@ -7,7 +7,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    frame::{GnssFix, TimestampNs},
+    frame::{GnssFix, Occlusion, TimestampNs},
     lane_map::MapLane,
     sensor::Sensor,
 };
@@ -32,7 +32,7 @@ pub struct Contribution {
 }
 
 /// A place on the way of a drive.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryPoint {
     /// Time at which the vehicle was there.
     pub time: TimestampNs,
@@ -48,6 +48,16 @@ pub struct TrajectoryPoint {
     pub turn_variance_rad2: f64,
     /// The GNSS fix taken there.
     pub fix: Option<GnssFix>,
+    /// What other vehicles hid from the camera there.
+    pub hidden: Vec<Occlusion>,
+}
+
+impl TrajectoryPoint {
+    /// Whether something hid a place on the road from the camera, so many metres ahead and to the left of the vehicle.
+    pub(super) fn hides(&self, ahead_m: f64, left_m: f64, sensor: &Sensor) -> bool {
+        let place = Point3::new(ahead_m, left_m, 0.0);
+        self.hidden.iter().any(|occlusion| occlusion.hides(&place, sensor))
+    }
 }
 
 impl Contribution {

@@ -77,6 +77,13 @@ impl Correction {
         before + (self.knots[knot + 1].apply(point_map) - before) * weight
     }
 
+    /// A direction in the drive's frame at an arc length, in the shared one.
+    pub(super) fn turn(&self, direction: &Vector3<f64>, arc_m: f64) -> Vector3<f64> {
+        let (sin, cos) = self.yaw_rad(arc_m).sin_cos();
+        let (x, y) = (cos * direction.x - sin * direction.y, sin * direction.x + cos * direction.y);
+        Vector3::new(x, y, direction.z)
+    }
+
     /// Turn from the drive's frame to the shared one at an arc length, radians.
     #[must_use]
     pub fn yaw_rad(&self, arc_m: f64) -> f64 {

@@ -1,48 +1,54 @@
 //! Fusion: contributions in, one map out. A pure function, whatever the order in which contributions arrived.
 //!
-//! Drives are taken in the order of their starts. Each is laid on the lines so far, matched, and adds its witnesses; what
-//! lies on no line extends one or begins one. Then all corrections are solved together, and the lines are made again,
-//! a few times over.
+//! Drives are taken in the order of their starts. Each is laid on the lines so far and adds to them. Then all
+//! corrections are solved together, and the lines are made again from them, a few times over.
+//!
+//! So that a place that thousands of drives pass costs no more than one that a few do, the oldest are folded, so many at a
+//! time, into a [`Base`]: lines that stay as they are, with the information of all of them, as one more drive that may
+//! still be shifted as a whole. Which drives are folded depends on their order of seniority alone, so that the
+//! map is the same function of the set of contributions.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    ops::Range,
-};
+use std::collections::BTreeMap;
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Rotation3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::{
-    alignment::{Sighting, Target, align},
+    alignment::{RobustScales, Sighting, Target, align},
+    base::Base,
     contribution::{Contribution, DriveId},
     correction::Correction,
-    line::{FusedLane, FusedLaneId, FusedPoint, Line, Lines, witness_at},
-    matching::{Run, match_lane},
+    growth::{Growing, Pieces},
+    line::{FusedLane, Lines},
+    matching::match_lanes,
     params::FleetParams,
-    persistence::{Belief, Evidence, LEAST_VIEWS, views},
     placement::{Placement, place},
-    prepared::{PreparedDrive, PreparedLane, normal_of},
+    prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
 };
-use crate::{
-    category::Category,
-    geometry::georeference::{Anchor, GeoreferenceFit},
+use crate::geometry::{
+    Pose,
+    georeference::{Anchor, GeoreferenceFit},
+    pose::yaw_rad,
 };
 
 /// How a drive lies in the map.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FusedDrive {
     /// The drive.
     pub drive: DriveId,
-    /// Its correction; `None` where it was kept apart.
+    /// Its correction; `None` where it was kept apart: it fits nowhere, at more than one place, or has no fix.
     pub correction: Option<Correction>,
 }
 
 /// A map of many drives.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FusedMap {
     /// Its lines, in the order of their names.
     pub lanes: Vec<FusedLane>,
-    /// Its drives, in the order of their seniority.
+    /// Its drives that are not folded, in the order of their seniority.
     pub drives: Vec<FusedDrive>,
+    /// Number of drives that are folded.
+    pub folded_drives: u32,
 }
 
 /// Fuses contributions into one map, east-north-up metres at `anchor`.
@@ -50,286 +56,200 @@ pub struct FusedMap {
 /// Of two contributions of one drive the later in the slice counts.
 #[must_use]
 pub fn fuse(contributions: &[Contribution], anchor: &Anchor, params: &FleetParams) -> FusedMap {
-    let mut by_seniority = BTreeMap::new();
-    for contribution in contributions.iter().filter(|contribution| !contribution.trajectory.is_empty()) {
-        by_seniority.insert(contribution.seniority(), contribution);
+    let ordered = by_seniority(contributions);
+    let mut base = Base::default();
+    let mut rest = ordered.as_slice();
+    while let Some((oldest, younger)) = split_to_fold(rest, params) {
+        base = fold(&base, oldest, anchor, params);
+        rest = younger;
     }
-    let drives: Vec<PreparedDrive<'_>> =
-        by_seniority.values().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
-    let mut fusion = Fusion::new(&drives, params);
-    fusion.place_all();
-    for _ in 0..params.rounds {
-        fusion.align_all();
-        fusion.draw_lines();
-    }
-    fusion.into_map()
+    fuse_onto(&base, rest, anchor, params)
 }
 
-struct Fusion<'a> {
-    drives: &'a [PreparedDrive<'a>],
-    params: &'a FleetParams,
-    corrections: Vec<Correction>,
-    placed: Vec<bool>,
-    lines: Lines,
+/// Contributions by seniority, one per drive.
+#[must_use]
+pub fn by_seniority(contributions: &[Contribution]) -> Vec<&Contribution> {
+    let with_way = contributions.iter().filter(|contribution| !contribution.trajectory.is_empty());
+    let by_drive: BTreeMap<DriveId, &Contribution> =
+        with_way.map(|contribution| (contribution.drive, contribution)).collect();
+    let mut ordered: Vec<&Contribution> = by_drive.into_values().collect();
+    ordered.sort_by_key(|contribution| contribution.seniority());
+    ordered
+}
+
+/// The drives that are folded next, and the others; `None` where none is to be.
+#[must_use]
+pub fn split_to_fold<'a, 'c>(
+    ordered: &'a [&'c Contribution],
+    params: &FleetParams,
+) -> Option<(&'a [&'c Contribution], &'a [&'c Contribution])> {
+    (ordered.len() >= params.drives_apart + params.drives_per_fold).then(|| ordered.split_at(params.drives_per_fold))
+}
+
+/// Folds the next drives into a base.
+#[must_use]
+pub fn fold(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &FleetParams) -> Base {
+    let prepared: Vec<PreparedDrive<'_>> =
+        drives.iter().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
+    let mut fusion = Fusion::new(base, &prepared, params);
+    fusion.run();
+    fusion.into_base(base)
+}
+
+/// Fuses the drives that are kept apart onto a base.
+#[must_use]
+pub fn fuse_onto(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &FleetParams) -> FusedMap {
+    let prepared: Vec<PreparedDrive<'_>> =
+        drives.iter().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
+    let mut fusion = Fusion::new(base, &prepared, params);
+    fusion.run();
+    fusion.into_map(base)
+}
+
+/// Drives while they are fused.
+pub(super) struct Fusion<'a> {
+    pub(super) drives: &'a [PreparedDrive<'a>],
+    pub(super) params: &'a FleetParams,
+    base: &'a Base,
+    /// Of each drive, then of the base.
+    pub(super) corrections: Vec<Correction>,
+    restraints: Vec<Restraints>,
+    pub(super) placed: Vec<bool>,
+    pub(super) lines: Lines,
 }
 
 /// Distance between two stations of a line in the alignment, knots.
 const STATION_KNOTS: usize = 2;
+/// A robust scale beyond any residual, metres.
+const UNBOUNDED_M: f64 = 1e4;
 
 impl<'a> Fusion<'a> {
-    fn new(drives: &'a [PreparedDrive<'a>], params: &'a FleetParams) -> Self {
-        let corrections: Vec<Option<Correction>> = drives.iter().map(|drive| by_gnss(drive, params)).collect();
-        let placed = corrections.iter().map(Option::is_some).collect();
-        let corrections = drives.iter().zip(corrections).map(|(drive, correction)| {
-            correction.unwrap_or_else(|| drive.rigid_correction(0.0, |point| *point, params))
-        });
-        Self { drives, params, corrections: corrections.collect(), placed, lines: Lines::default() }
+    fn new(base: &'a Base, drives: &'a [PreparedDrive<'a>], params: &'a FleetParams) -> Self {
+        let by_gnss: Vec<Option<Correction>> = drives.iter().map(|drive| by_gnss(drive, params)).collect();
+        let placed = by_gnss.iter().map(Option::is_some).collect();
+        let own = drives.iter().zip(by_gnss);
+        let own =
+            own.map(|(drive, found)| found.unwrap_or_else(|| drive.rigid_correction(0.0, |point| *point, params)));
+        let corrections = own.chain([Correction::identity()]).collect();
+        let restraints = drives.iter().map(|drive| drive.restraints.clone());
+        let restraints = restraints.chain([base.restraints(params)]).collect();
+        Self { drives, params, base, corrections, restraints, placed, lines: base.lines(drives.len()) }
     }
 
-    /// Lays every drive on the lines of those before it.
-    fn place_all(&mut self) {
-        for index in 0..self.drives.len() {
-            if !self.placed[index] {
-                continue;
-            }
-            let drive = &self.drives[index];
-            let sigma_m = self.prior_sigma_m(index);
-            let posterior = |line: usize| self.posterior(line);
-            let placement =
-                place(drive, index, &self.corrections[index], &self.lines, &posterior, sigma_m, self.params);
-            match placement {
-                Placement::Alone => {}
-                Placement::Refused { .. } => {
-                    self.placed[index] = false;
-                    continue;
-                }
-                Placement::Found(sightings) => {
-                    self.fit_one(index, sightings);
-                    for _ in 0..2 {
-                        let sightings = self.sightings_of(index);
-                        self.fit_one(index, sightings);
-                    }
-                }
-            }
-            self.add_drive(index);
+    fn run(&mut self) {
+        self.place_all();
+        for _ in 0..self.params.rounds {
+            self.align_all();
+            self.draw_lines();
+        }
+        if self.keep_apart_misfits() {
+            self.align_all();
+            self.draw_lines();
         }
     }
 
+    /// Every pass of every drive that is placed, with its drive and its number among all.
+    pub(super) fn passes(&self) -> impl Iterator<Item = (usize, usize, &'a PreparedPass<'a>)> + use<'a> {
+        let drives = self.drives;
+        let placed = self.placed.clone();
+        let all = drives
+            .iter()
+            .enumerate()
+            .flat_map(|(drive, prepared)| prepared.passes.iter().map(move |pass| (drive, pass)));
+        all.enumerate().map(|(number, (drive, pass))| (drive, number, pass)).filter(move |(drive, ..)| placed[*drive])
+    }
+
+    /// Lays every drive, pass by pass, on the lines of those before it; those that fit nowhere once more at the end.
+    fn place_all(&mut self) {
+        let mut pieces = Pieces::new();
+        let mut later = Vec::new();
+        let mut first_pass = 0;
+        for drive in 0..self.drives.len() {
+            if self.placed[drive] && !self.place_drive(drive, first_pass, &mut pieces) {
+                later.push((drive, first_pass));
+            }
+            first_pass += self.drives[drive].passes.len();
+        }
+        for (drive, first_pass) in later {
+            self.placed[drive] = self.place_drive(drive, first_pass, &mut pieces);
+        }
+    }
+
+    /// Lays one drive on the lines and adds it to them; whether it was found.
+    fn place_drive(&mut self, drive: usize, first_pass: usize, pieces: &mut Pieces) -> bool {
+        let prepared = &self.drives[drive];
+        for (index, pass) in prepared.passes.iter().enumerate() {
+            let sigma_m = if index == 0 { self.prior_sigma_m(drive) } else { self.params.gnss_bias_sigma_m };
+            match place(&pass.lanes, drive, &self.corrections[drive], &self.lines, sigma_m, self.params) {
+                Placement::Refused if index == 0 => return false,
+                // A later pass that fits nowhere lies where odometry puts it after the one before.
+                Placement::Alone | Placement::Refused => {}
+                Placement::Found(sightings) => {
+                    let before = &prepared.passes[..index];
+                    let mut all = self.sightings_of(drive, before);
+                    all.extend(sightings);
+                    self.fit_one(drive, all, UNBOUNDED_M);
+                    for robust_scale_m in [4.0, 2.0, 1.0].map(|factor| factor * self.params.robust_scale_m) {
+                        let sightings = self.sightings_of(drive, &prepared.passes[..=index]);
+                        self.fit_one(drive, sightings, robust_scale_m);
+                    }
+                }
+            }
+            self.grow(drive, first_pass + index, pass, pieces);
+        }
+        self.placed[drive] = true;
+        true
+    }
+
+    fn grow(&mut self, drive: usize, number: usize, pass: &PreparedPass<'_>, pieces: &mut Pieces) {
+        let contribution = self.drives[drive].contribution;
+        let growing = Growing { contribution, pass, drive, number, params: self.params };
+        growing.add_to(&mut self.lines, &self.corrections, pieces);
+    }
+
     /// Solves for one drive's correction while the lines stay.
-    fn fit_one(&mut self, index: usize, mut sightings: Vec<Sighting>) {
-        sightings.iter_mut().for_each(|sighting| sighting.drive = 0);
-        let correction = &mut self.corrections[index..=index];
-        align(&[&self.drives[index]], correction, &sightings, 0, self.params);
+    fn fit_one(&mut self, drive: usize, mut sightings: Vec<Sighting>, robust_scale_m: f64) {
+        for sighting in &mut sightings {
+            sighting.drive = 0;
+        }
+        let correction = &mut self.corrections[drive..=drive];
+        let scales = RobustScales { lanes_m: robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
+        align(&[&self.restraints[drive]], correction, &sightings, 0, scales);
     }
 
     /// Standard deviation of where GNSS puts a drive against the map so far.
-    fn prior_sigma_m(&self, index: usize) -> f64 {
-        let fixes = &self.drives[index].fixes;
-        let mean = fixes.iter().map(|fix| fix.horizontal_sigma_m).sum::<f64>() / fixes.len().max(1) as f64;
-        let own = mean.max(self.params.gnss_bias_sigma_m);
-        let before = self.placed[..index].iter().filter(|placed| **placed).count().max(1);
-        own * (1.0 + 1.0 / before as f64).sqrt()
+    fn prior_sigma_m(&self, drive: usize) -> f64 {
+        let before = self.placed[..drive].iter().filter(|placed| **placed).count() + self.base.drives();
+        self.restraints[drive].bias_sigma_m[0] * (1.0 + 1.0 / before.max(1) as f64).sqrt()
     }
 
-    fn sightings_of(&self, index: usize) -> Vec<Sighting> {
-        let matched = self.match_drive(index);
+    /// Where lanes of some passes of a drive lie on lines.
+    fn sightings_of(&self, drive: usize, passes: &[PreparedPass<'_>]) -> Vec<Sighting> {
         let mut sightings = Vec::new();
-        for (lane, runs) in self.drives[index].lanes.iter().zip(&matched) {
-            for run in runs {
-                let line = &self.lines.lines[run.line];
-                let Some(curve) = line.curve() else { continue };
-                for (sample, parameter) in lane.samples[run.samples.clone()].iter().zip(&run.parameters).step_by(2) {
+        let deflation = self.params.lane_correlation_m / self.params.sample_m;
+        for pass in passes {
+            let matched = match_lanes(&pass.lanes, &self.corrections[drive], &self.lines, self.params);
+            for (lane, run) in
+                pass.lanes.iter().zip(&matched).flat_map(|(lane, runs)| runs.iter().map(move |run| (lane, run)))
+            {
+                let Some(curve) = self.lines.lines[run.line].curve() else { continue };
+                let on_line = lane.samples[run.samples.clone()].iter().zip(&run.parameters);
+                sightings.extend(on_line.map(|(sample, parameter)| {
                     let (place, normal) = (curve.point(*parameter), normal_of(&curve.derivative(*parameter)));
-                    let deflation = self.params.lane_correlation_m / (2.0 * self.params.sample_m);
-                    sightings.push(Sighting {
-                        drive: index,
+                    Sighting {
+                        drive,
                         arc_m: sample.arc_m,
                         map: sample.map,
                         normal,
                         across: Target::Fixed(place.coords.xy().dot(&normal)),
                         height: Target::Fixed(place.z),
-                        lateral_variance_m2: (sample.lateral_variance_m2 + self.params.lane_sigma_m.powi(2))
-                            * deflation,
-                        height_variance_m2: (sample.height_variance_m2 + self.params.lane_sigma_height_m.powi(2))
-                            * deflation,
-                    });
-                }
+                        lateral_variance_m2: sample.lateral_variance_m2 * deflation,
+                        height_variance_m2: sample.height_variance_m2 * deflation,
+                    }
+                }));
             }
         }
         sightings
-    }
-
-    /// Runs of each lane of a drive on the lines.
-    fn match_drive(&self, index: usize) -> Vec<Vec<Run>> {
-        let drive = &self.drives[index];
-        let correction = &self.corrections[index];
-        let posterior = |line: usize| self.posterior(line);
-        let run_of = |lane: &PreparedLane<'_>, taken: &[Run]| {
-            let is_taken = |line: usize, parameter: f64| {
-                taken.iter().any(|run| {
-                    let (low, high) = ends(run);
-                    run.line == line && parameter > low - 0.5 && parameter < high + 0.5
-                })
-            };
-            let own = &lane.lane.category_posterior;
-            match_lane(lane, own, correction, &self.lines, &posterior, &is_taken, self.params)
-        };
-        let first: Vec<Vec<Run>> = drive.lanes.iter().map(|lane| run_of(lane, &[])).collect();
-        let mut order: Vec<usize> = (0..first.len()).collect();
-        let fit = |lane: &usize| {
-            let runs = &first[*lane];
-            let samples: usize = runs.iter().map(|run| run.parameters.len()).sum();
-            runs.iter().map(|run| run.cost * run.parameters.len() as f64).sum::<f64>() / samples.max(1) as f64
-                - (samples as f64).sqrt() * 0.1
-        };
-        order.sort_by(|a, b| fit(a).total_cmp(&fit(b)).then(a.cmp(b)));
-        let mut matched = vec![Vec::new(); first.len()];
-        let mut taken: Vec<Run> = Vec::new();
-        for lane in order {
-            let runs = run_of(&drive.lanes[lane], &taken);
-            taken.extend(runs.iter().cloned());
-            matched[lane] = runs;
-        }
-        matched
-    }
-
-    /// Adds a drive's witnesses to the lines, and the lines that it alone saw.
-    fn add_drive(&mut self, index: usize) {
-        let matched = self.match_drive(index);
-        let before = self.lines.lines.len();
-        let mut touched = std::collections::BTreeSet::new();
-        for (lane_index, runs) in matched.iter().enumerate() {
-            for run in runs {
-                self.testify(index, lane_index, run);
-                touched.insert(run.line);
-            }
-            let extended = self.add_rest(index, lane_index, runs);
-            touched.extend(extended);
-        }
-        for line in touched.into_iter().filter(|line| *line < before) {
-            self.lines.lines[line].settle(&self.corrections, self.params);
-        }
-        self.lines.index();
-    }
-
-    /// Witnesses of a run at the knots of its line.
-    fn testify(&mut self, index: usize, lane_index: usize, run: &Run) {
-        let lane = &self.drives[index].lanes[lane_index];
-        let line = &mut self.lines.lines[run.line];
-        let first_sample = *run.samples.start();
-        for (step, pair) in run.parameters.windows(2).enumerate() {
-            let (low, high) = (pair[0].min(pair[1]), pair[0].max(pair[1]));
-            let (from, to) = (&lane.samples[first_sample + step], &lane.samples[first_sample + step + 1]);
-            let mut knot = super::prepared::count_of(low.ceil());
-            while (knot as f64) < high && knot < line.points.len() {
-                let share = (knot as f64 - pair[0]) / (pair[1] - pair[0]);
-                let parameter = from.parameter + (to.parameter - from.parameter) * share;
-                line.testify(knot, witness_at(index, lane_index, lane, first_sample + step, parameter));
-                knot += 1;
-            }
-        }
-    }
-
-    /// What of a lane lies on no line: extends the line that it leaves at its end, or begins a line.
-    fn add_rest(&mut self, index: usize, lane_index: usize, runs: &[Run]) -> Vec<usize> {
-        let samples = self.drives[index].lanes[lane_index].samples.len();
-        let mut extended = Vec::new();
-        let mut next = 0;
-        let mut before: Option<&Run> = None;
-        let mut piece = 0;
-        for run in runs.iter().map(Some).chain([None]) {
-            let end = run.map_or(samples, |run| *run.samples.start());
-            if end > next {
-                let rest = next..=end - 1;
-                let grows = before.filter(|run| self.leaves_at_end(run, true)).map(|run| (run, true));
-                let grows = grows.or_else(|| run.filter(|run| self.leaves_at_end(run, false)).map(|run| (run, false)));
-                match grows {
-                    Some((run, onward)) => {
-                        self.extend(index, lane_index, run, onward, rest);
-                        extended.push(run.line);
-                    }
-                    None => self.begin(index, lane_index, rest, &mut piece),
-                }
-            }
-            if let Some(run) = run {
-                next = *run.samples.end() + 1;
-            }
-            before = run;
-        }
-        extended
-    }
-
-    /// Whether a run ends (`onward`) or begins where its line does.
-    fn leaves_at_end(&self, run: &Run, onward: bool) -> bool {
-        const NEAR_END: f64 = 1.5;
-        let last = (self.lines.lines[run.line].points.len() - 1) as f64;
-        let forward = run.parameters[run.parameters.len() - 1] >= run.parameters[0];
-        let at = if onward { run.parameters[run.parameters.len() - 1] } else { run.parameters[0] };
-        if forward == onward { at > last - NEAR_END } else { at < NEAR_END }
-    }
-
-    fn extend(
-        &mut self,
-        index: usize,
-        lane_index: usize,
-        run: &Run,
-        onward: bool,
-        rest: std::ops::RangeInclusive<usize>,
-    ) {
-        let lane = &self.drives[index].lanes[lane_index];
-        let correction = &self.corrections[index];
-        let forward = run.parameters[run.parameters.len() - 1] >= run.parameters[0];
-        let at_tail = forward == onward;
-        let line = &mut self.lines.lines[run.line];
-        let order: Vec<usize> = if onward { rest.collect() } else { rest.rev().collect() };
-        for sample in order {
-            let near = &lane.samples[sample];
-            let place = correction.apply(&near.map, near.arc_m);
-            let end = if at_tail { line.points[line.points.len() - 1] } else { line.points[0] };
-            let direction = if at_tail { line.tangent(line.points.len() - 1) } else { -line.tangent(0) };
-            let offset = place - end;
-            if offset.norm() < self.params.line_knot_m || offset.dot(&direction) <= 0.0 {
-                continue;
-            }
-            let witness = witness_at(index, lane_index, lane, sample, near.parameter);
-            if at_tail {
-                line.points.push(place);
-                line.witnesses.push(vec![witness]);
-            } else {
-                line.points.insert(0, place);
-                line.witnesses.insert(0, vec![witness]);
-            }
-        }
-    }
-
-    fn begin(&mut self, index: usize, lane_index: usize, rest: std::ops::RangeInclusive<usize>, piece: &mut u32) {
-        let drive = &self.drives[index];
-        let lane = &drive.lanes[lane_index];
-        let correction = &self.corrections[index];
-        let (mut points, mut witnesses): (Vec<Point3<f64>>, Vec<_>) = (Vec::new(), Vec::new());
-        for sample in rest {
-            let near = &lane.samples[sample];
-            let place = correction.apply(&near.map, near.arc_m);
-            if points.last().is_some_and(|last| nalgebra::distance(last, &place) < self.params.line_knot_m) {
-                continue;
-            }
-            points.push(place);
-            witnesses.push(vec![witness_at(index, lane_index, lane, sample, near.parameter)]);
-        }
-        let length_m = (points.len().saturating_sub(1)) as f64 * self.params.line_knot_m;
-        if length_m < self.params.shortest_lane_m {
-            return;
-        }
-        let contribution = drive.contribution;
-        let id = FusedLaneId {
-            started: contribution.started,
-            drive: contribution.drive,
-            lane: lane.lane.id,
-            piece: *piece,
-            stretch: 0,
-        };
-        *piece += 1;
-        self.lines.push(Line { id, points, witnesses });
     }
 
     /// Solves for all corrections and all lines together.
@@ -339,37 +259,35 @@ impl<'a> Fusion<'a> {
         let deflation = self.params.lane_correlation_m / (STATION_KNOTS as f64 * self.params.line_knot_m);
         for line in &self.lines.lines {
             for knot in (0..line.points.len()).step_by(STATION_KNOTS) {
-                if line.witnesses[knot].len() < 2 {
+                let witnesses = &line.knots[knot].witnesses;
+                if witnesses.len() < 2 {
                     continue;
                 }
                 let normal = normal_of(&line.tangent(knot));
-                sightings.extend(line.witnesses[knot].iter().map(|witness| Sighting {
+                sightings.extend(witnesses.iter().map(|witness| Sighting {
                     drive: witness.drive,
                     arc_m: witness.arc_m,
                     map: witness.map,
                     normal,
                     across: Target::Station(stations),
                     height: Target::Station(stations),
-                    lateral_variance_m2: (witness.lateral_variance_m2 + self.params.lane_sigma_m.powi(2)) * deflation
-                        / witness.share,
-                    height_variance_m2: (witness.height_variance_m2 + self.params.lane_sigma_height_m.powi(2))
-                        * deflation
-                        / witness.share,
+                    lateral_variance_m2: witness.lateral_variance_m2 * deflation / witness.share,
+                    height_variance_m2: witness.height_variance_m2 * deflation / witness.share,
                 }));
                 stations += 1;
             }
         }
-        let drives: Vec<&PreparedDrive<'_>> = self.drives.iter().collect();
-        align(&drives, &mut self.corrections, &sightings, stations, self.params);
+        let restraints: Vec<&Restraints> = self.restraints.iter().collect();
+        let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
+        align(&restraints, &mut self.corrections, &sightings, stations, scales);
     }
 
     /// Makes the lines again from the corrections as they are.
     fn draw_lines(&mut self) {
-        self.lines = Lines::default();
-        for index in 0..self.drives.len() {
-            if self.placed[index] {
-                self.add_drive(index);
-            }
+        self.lines = self.base.lines(self.drives.len());
+        let mut pieces = Pieces::new();
+        for (drive, number, pass) in self.passes() {
+            self.grow(drive, number, pass, &mut pieces);
         }
         for line in &mut self.lines.lines {
             line.settle(&self.corrections, self.params);
@@ -377,119 +295,29 @@ impl<'a> Fusion<'a> {
         self.lines.index();
     }
 
-    /// Belief over the categories of a line: the mean of its witnesses', weighed by how much of it each saw.
-    fn posterior(&self, line: usize) -> Vec<f64> {
-        let mut sum = vec![0.0; Category::ALL.len()];
-        for witness in self.lines.lines[line].witnesses.iter().step_by(4).flatten() {
-            let own = &self.drives[witness.drive].lanes[witness.lane].lane.category_posterior;
-            sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += own);
-        }
-        let total: f64 = sum.iter().sum();
-        if total > 0.0 {
-            sum.iter_mut().for_each(|value| *value /= total);
-        }
-        sum
-    }
-
-    /// Probability of each knot of each line to be there, and the drives that had it in view.
-    fn existence(&self) -> Vec<Vec<Belief>> {
-        let mut beliefs: Vec<Vec<Belief>> =
-            self.lines.lines.iter().map(|line| vec![Belief::new(); line.points.len()]).collect();
-        for index in (0..self.drives.len()).filter(|index| self.placed[*index]) {
-            let views = views(&self.drives[index], &self.corrections[index], &self.lines);
-            for ((line, beliefs), views) in self.lines.lines.iter().zip(&mut beliefs).zip(&views.of) {
-                for ((witnesses, belief), (views, side_m)) in line.witnesses.iter().zip(beliefs).zip(views) {
-                    if witnesses.iter().any(|witness| witness.drive == index) {
-                        belief.hear(Evidence::Seen, f64::from(*side_m));
-                    } else if *views >= LEAST_VIEWS {
-                        belief.hear(Evidence::Missed, f64::from(*side_m));
-                    }
+    /// Takes out drives whose lanes do not lie where those of others do, though they were laid on them; whether any.
+    fn keep_apart_misfits(&mut self) -> bool {
+        let mut residuals: Vec<Vec<f64>> = vec![Vec::new(); self.drives.len()];
+        for line in &self.lines.lines {
+            for (knot, at) in line.knots.iter().enumerate().filter(|(_, at)| at.witnesses.len() >= 3) {
+                let normal = normal_of(&line.tangent(knot));
+                for witness in at.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
+                    let place = self.corrections[witness.drive].apply(&witness.map, witness.arc_m);
+                    residuals[witness.drive].push((place - line.points[knot]).xy().dot(&normal).abs());
                 }
             }
         }
-        beliefs
-    }
-
-    fn into_map(self) -> FusedMap {
-        let existence = self.existence();
-        let mut lanes: Vec<FusedLane> = Vec::new();
-        for (line, existence) in existence.iter().enumerate() {
-            let points = self.fused_points(line, existence);
-            for (stretch, knots) in stretches(&points, self.params).into_iter().enumerate() {
-                lanes.extend(self.fused_lane(line, stretch, &points[knots.clone()], knots));
+        let mut any = false;
+        for (drive, residuals) in residuals.iter_mut().enumerate() {
+            residuals.sort_by(f64::total_cmp);
+            let middle = residuals.get(residuals.len() / 2).copied().unwrap_or(0.0);
+            if self.placed[drive] && middle > self.params.most_misfit_m {
+                self.placed[drive] = false;
+                any = true;
             }
         }
-        lanes.sort_by_key(|lane| lane.id);
-        let drives = self.drives.iter().zip(&self.placed).zip(self.corrections).map(|((drive, placed), correction)| {
-            FusedDrive { drive: drive.contribution.drive, correction: placed.then_some(correction) }
-        });
-        FusedMap { lanes, drives: drives.collect() }
+        any
     }
-
-    fn fused_points(&self, index: usize, existence: &[Belief]) -> Vec<FusedPoint> {
-        let line = &self.lines.lines[index];
-        let points = (0..line.points.len()).map(|knot| {
-            let normal = normal_of(&line.tangent(knot));
-            let mean = line.mean_offset(knot, &normal, &self.corrections, self.params);
-            FusedPoint {
-                position: line.points[knot],
-                lateral_sigma_m: mean.across_information.max(1e-6).powf(-0.5),
-                height_sigma_m: mean.height_information.max(1e-6).powf(-0.5),
-                drives: u32::try_from(line.witnesses[knot].len()).unwrap_or(u32::MAX),
-                existence: existence[knot].probability,
-            }
-        });
-        points.collect()
-    }
-
-    fn fused_lane(
-        &self,
-        index: usize,
-        stretch: usize,
-        points: &[FusedPoint],
-        knots: Range<usize>,
-    ) -> Option<FusedLane> {
-        let line = &self.lines.lines[index];
-        let witnesses = || line.witnesses[knots.clone()].iter().flatten();
-        let lanes: BTreeSet<(usize, usize)> = witnesses().map(|witness| (witness.drive, witness.lane)).collect();
-        let drives: BTreeSet<usize> = lanes.iter().map(|(drive, _)| *drive).collect();
-        let seen = || lanes.iter().map(|(drive, lane)| self.drives[*drive].lanes[*lane].lane);
-        let category_posterior = self.posterior(index);
-        let best = (0..category_posterior.len())
-            .max_by(|a, b| category_posterior[*a].total_cmp(&category_posterior[*b]))
-            .unwrap_or(0);
-        Some(FusedLane {
-            id: FusedLaneId { stretch: u32::try_from(stretch).unwrap_or(u32::MAX), ..line.id },
-            category: Category::ALL[best],
-            category_posterior,
-            points: points.to_vec(),
-            drives: u32::try_from(drives.len()).unwrap_or(u32::MAX),
-            observations: seen().map(|lane| u64::from(lane.observations)).sum(),
-            first_seen: seen().map(|lane| lane.first_seen).min()?,
-            last_seen: seen().map(|lane| lane.last_seen).max()?,
-        })
-    }
-}
-
-/// Runs of knots that are there and whose place is known, of at least the shortest length.
-fn stretches(points: &[FusedPoint], params: &FleetParams) -> Vec<Range<usize>> {
-    let mut stretches: Vec<Range<usize>> = Vec::new();
-    let shown = |point: &FusedPoint| {
-        point.existence >= params.least_existence && point.lateral_sigma_m <= params.most_lateral_sigma_m
-    };
-    for (knot, _) in points.iter().enumerate().filter(|(_, point)| shown(point)) {
-        match stretches.last_mut() {
-            Some(open) if open.end + params.bridged_knots >= knot => open.end = knot + 1,
-            _ => stretches.push(knot..knot + 1),
-        }
-    }
-    stretches.retain(|knots| (knots.len() as f64 - 1.0) * params.line_knot_m >= params.shortest_lane_m);
-    stretches
-}
-
-fn ends(run: &Run) -> (f64, f64) {
-    let (first, last) = (run.parameters[0], run.parameters[run.parameters.len() - 1]);
-    (first.min(last), first.max(last))
 }
 
 /// Where GNSS and odometry alone put a drive; `None` without fixes.
@@ -497,16 +325,17 @@ fn by_gnss(drive: &PreparedDrive<'_>, params: &FleetParams) -> Option<Correction
     let mut fit = GeoreferenceFit::default();
     for point in &drive.contribution.trajectory {
         if let Some(fix) = &point.fix {
-            let pose = crate::geometry::Pose::new(point.position.coords, nalgebra::Vector3::z() * point.yaw_rad);
-            fit.observe(fix, &pose);
+            fit.observe(fix, &Pose::new(point.position.coords, Vector3::z() * point.yaw_rad));
         }
     }
-    let yaw = crate::geometry::pose::yaw_rad(&fit.georeference()?.enu_from_map);
-    let first = drive.fixes.first()?;
-    let turn = nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), yaw);
-    let correction = drive.rigid_correction(yaw, |point| first.shared + turn * (point - first.map), params);
-    let mut corrections = [correction];
-    align(&[drive], &mut corrections, &[], 0, params);
+    let yaw_rad = yaw_rad(&fit.georeference()?.enu_from_map);
+    let first = drive.restraints.fixes.first()?;
+    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad);
+    let shared_from_map = |point: &Point3<f64>| first.shared + turn * (point - first.map);
+    let mut corrections = [drive.rigid_correction(yaw_rad, shared_from_map, params)];
+    for fixes_m in [UNBOUNDED_M, 4.0 * params.gnss_robust_scale_m, 2.0 * params.gnss_robust_scale_m] {
+        align(&[&drive.restraints], &mut corrections, &[], 0, RobustScales { lanes_m: UNBOUNDED_M, fixes_m });
+    }
     let [correction] = corrections;
     Some(correction)
 }

@@ -7,7 +7,7 @@
 //! one line are correlated, a drive is one witness at each knot, however many frames saw it. Its variance is `1 / sum w_i`.
 //! Near the ends of a drive's lane its weight tapers off, so that the mean does not jump where a witness comes or goes.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use nalgebra::{Point3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
@@ -17,6 +17,7 @@ use super::{
     contribution::DriveId,
     correction::Correction,
     params::FleetParams,
+    persistence::Belief,
     prepared::{PreparedLane, normal_of},
 };
 use crate::{
@@ -77,10 +78,14 @@ pub struct FusedLane {
     pub last_seen: TimestampNs,
 }
 
-/// What one drive says of one knot.
+/// What one pass of a drive says of one knot.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Witness {
+    /// The drive, as a number among the corrections.
     pub(super) drive: usize,
+    /// The pass, as a number among those of all drives; [`BASE`] for what was folded.
+    pub(super) pass: usize,
+    /// The lane, as a number among those of the pass.
     pub(super) lane: usize,
     /// Map frame of the drive.
     pub(super) map: Point3<f64>,
@@ -91,12 +96,54 @@ pub(super) struct Witness {
     pub(super) share: f64,
 }
 
+/// The pass of a witness that stands for drives that were folded.
+pub(super) const BASE: usize = usize::MAX;
+
 /// A line while it is made.
 #[derive(Clone, Debug)]
 pub(super) struct Line {
     pub(super) id: FusedLaneId,
     pub(super) points: Vec<Point3<f64>>,
-    pub(super) witnesses: Vec<Vec<Witness>>,
+    pub(super) knots: Vec<Knot>,
+    /// Sum of the category posteriors of its witnesses, by length.
+    pub(super) category_votes: Vec<f64>,
+    /// The same, with the sum 1.
+    posterior: Vec<f64>,
+    /// What is known of it from drives that were folded.
+    pub(super) record: LineRecord,
+}
+
+/// A knot of a line while it is made.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Knot {
+    pub(super) witnesses: Vec<Witness>,
+    /// What is known of it from drives that were folded.
+    pub(super) record: KnotRecord,
+}
+
+impl Knot {
+    /// Number of drives that saw it.
+    pub(super) fn drives(&self) -> u32 {
+        let apart = self.witnesses.iter().filter(|witness| witness.pass != BASE).map(|witness| witness.drive);
+        let apart: BTreeSet<usize> = apart.collect();
+        self.record.drives + u32::try_from(apart.len()).unwrap_or(u32::MAX)
+    }
+}
+
+/// What drives that were folded said of a line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct LineRecord {
+    pub(super) drives: u32,
+    pub(super) observations: u64,
+    pub(super) first_seen: Option<TimestampNs>,
+    pub(super) last_seen: Option<TimestampNs>,
+}
+
+/// What drives that were folded said of a knot.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct KnotRecord {
+    pub(super) drives: u32,
+    pub(super) belief: Belief,
 }
 
 /// All lines, and which run near a place.
@@ -117,6 +164,46 @@ fn cell(x: f64, y: f64) -> (i32, i32) {
 }
 
 impl Line {
+    pub(super) fn new(id: FusedLaneId) -> Self {
+        let categories = Category::ALL.len();
+        Self {
+            id,
+            points: Vec::new(),
+            knots: Vec::new(),
+            category_votes: vec![0.0; categories],
+            posterior: vec![1.0 / categories as f64; categories],
+            record: LineRecord::default(),
+        }
+    }
+
+    /// Adds a knot behind the last.
+    pub(super) fn push(&mut self, point: Point3<f64>, knot: Knot) {
+        self.points.push(point);
+        self.knots.push(knot);
+    }
+
+    /// Adds a knot before the first.
+    pub(super) fn push_front(&mut self, point: Point3<f64>, knot: Knot) {
+        self.points.insert(0, point);
+        self.knots.insert(0, knot);
+    }
+
+    /// Takes a witness' belief over the categories, for so many metres.
+    pub(super) fn vote(&mut self, posterior: &[f64], length_m: f64) {
+        for (sum, own) in self.category_votes.iter_mut().zip(posterior) {
+            *sum += own * length_m;
+        }
+        let total: f64 = self.category_votes.iter().sum();
+        if total > 0.0 {
+            self.posterior = self.category_votes.iter().map(|vote| vote / total).collect();
+        }
+    }
+
+    /// Belief over its categories, in the order of [`Category::ALL`]: the mean of its witnesses'.
+    pub(super) fn posterior(&self) -> &[f64] {
+        &self.posterior
+    }
+
     pub(super) fn curve(&self) -> Option<Curve<'_, [Point3<f64>]>> {
         Curve::new(self.points.as_slice(), EndRule::Reflected)
     }
@@ -128,10 +215,10 @@ impl Line {
         (after - before).try_normalize(1e-9).unwrap_or_else(Vector3::x)
     }
 
-    /// Adds a witness to a knot. Of two of the same drive the more certain stays.
+    /// Adds a witness to a knot. Of two of the same pass the more certain stays.
     pub(super) fn testify(&mut self, knot: usize, witness: Witness) {
-        let at = &mut self.witnesses[knot];
-        match at.iter_mut().find(|other| other.drive == witness.drive) {
+        let at = &mut self.knots[knot].witnesses;
+        match at.iter_mut().find(|other| other.pass == witness.pass) {
             Some(other) if other.lateral_variance_m2 <= witness.lateral_variance_m2 => {}
             Some(other) => *other = witness,
             None => at.push(witness),
@@ -157,17 +244,13 @@ impl Line {
         params: &FleetParams,
     ) -> MeanOffset {
         let place = self.points[knot];
-        let offsets = self.witnesses[knot].iter().map(|witness| {
+        let offsets = self.knots[knot].witnesses.iter().map(|witness| {
             let offset = corrections[witness.drive].apply(&witness.map, witness.arc_m) - place;
             (offset.xy().dot(normal), offset.z, witness)
         });
         let offsets: Vec<(f64, f64, &Witness)> = offsets.collect();
-        let across = offsets.iter().map(|(across, _, witness)| {
-            (*across, witness.share / (witness.lateral_variance_m2 + params.lane_sigma_m.powi(2)))
-        });
-        let height = offsets.iter().map(|(_, height, witness)| {
-            (*height, witness.share / (witness.height_variance_m2 + params.lane_sigma_height_m.powi(2)))
-        });
+        let across = offsets.iter().map(|(across, _, witness)| (*across, witness.share / witness.lateral_variance_m2));
+        let height = offsets.iter().map(|(_, height, witness)| (*height, witness.share / witness.height_variance_m2));
         let (across_m, across_information) = robust_mean(&across.collect::<Vec<_>>(), params.robust_scale_m);
         let (height_m, height_information) = robust_mean(&height.collect::<Vec<_>>(), 2.0 * params.robust_scale_m);
         MeanOffset { across_m, height_m, across_information, height_information }
@@ -213,10 +296,10 @@ fn weighted_median(values: &[(f64, f64)]) -> f64 {
     let mut below = 0.0;
     for (index, (value, weight)) in sorted.iter().enumerate() {
         below += weight;
-        if below > half {
+        if below > half * (1.0 + 1e-12) {
             return *value;
         }
-        if below == half && index + 1 < sorted.len() {
+        if below >= half * (1.0 - 1e-12) && index + 1 < sorted.len() {
             return 0.5 * (value + sorted[index + 1].0);
         }
     }
@@ -224,12 +307,6 @@ fn weighted_median(values: &[(f64, f64)]) -> f64 {
 }
 
 impl Lines {
-    /// Adds a line and says which it is.
-    pub(super) fn push(&mut self, line: Line) -> usize {
-        self.lines.push(line);
-        self.lines.len() - 1
-    }
-
     /// Finds knots by place again, after lines moved or grew.
     pub(super) fn index(&mut self) {
         self.grid.clear();
@@ -282,8 +359,7 @@ impl Lines {
 
 /// The witness that a drive's lane is at a spline parameter of its own.
 pub(super) fn witness_at(
-    drive: usize,
-    lane_index: usize,
+    (drive, pass, lane_index): (usize, usize, usize),
     lane: &PreparedLane<'_>,
     sample: usize,
     parameter: f64,
@@ -294,6 +370,7 @@ pub(super) fn witness_at(
     let to_end_m = nalgebra::distance(&map, &first.map).min(nalgebra::distance(&map, &last.map));
     Witness {
         drive,
+        pass,
         lane: lane_index,
         map,
         arc_m: near.arc_m,

@@ -5,6 +5,8 @@
 //! of one drive do not share a stretch of a line: where two want it, the one that fits it better has it.
 //! A lane may run against the line's direction: oncoming traffic sees the same paint.
 
+use std::{collections::BTreeMap, ops::RangeInclusive};
+
 use nalgebra::Point3;
 
 use super::{
@@ -20,7 +22,7 @@ use crate::{category::Category, spline::foot_point::foot_point_refined};
 pub(super) struct Run {
     pub(super) line: usize,
     /// First and last sample of the lane.
-    pub(super) samples: std::ops::RangeInclusive<usize>,
+    pub(super) samples: RangeInclusive<usize>,
     /// Parameter on the line of each of these samples.
     pub(super) parameters: Vec<f64>,
     /// Mean cost of a sample.
@@ -46,50 +48,95 @@ const ALIGNMENT_SIGMA_M: f64 = 0.2;
 /// Least cosine of the angle between a lane and its line.
 const LEAST_COSINE: f64 = 0.88;
 /// Shortest run, samples.
-const SHORTEST_RUN: usize = 4;
+const SHORTEST_RUN: usize = 3;
 /// Knots by which a lane may jump along a line between two samples.
 const LONGEST_JUMP: f64 = 3.0;
 
-/// Runs of one lane on the lines, in the order of the lane. `taken` tells which stretches other lanes of the drive have.
+/// Runs of one lane on the lines, in the order of the lane. `is_taken` tells which stretches other lanes of the drive have.
 pub(super) fn match_lane(
     lane: &PreparedLane<'_>,
-    posterior: &[f64],
     correction: &Correction,
     lines: &Lines,
-    line_posterior: &dyn Fn(usize) -> Vec<f64>,
     is_taken: &dyn Fn(usize, f64) -> bool,
     params: &FleetParams,
 ) -> Vec<Run> {
-    let mut agreement = std::collections::BTreeMap::new();
-    let mut cost_of_category =
-        |line: usize| *agreement.entry(line).or_insert_with(|| category_cost(posterior, &line_posterior(line)));
-    let candidates: Vec<Vec<Candidate>> = lane
-        .samples
-        .iter()
-        .map(|sample| {
-            let place = correction.apply(&sample.map, sample.arc_m);
-            let (sin, cos) = correction.yaw_rad(sample.arc_m).sin_cos();
-            let direction = nalgebra::Vector2::new(
-                cos * sample.tangent.x - sin * sample.tangent.y,
-                sin * sample.tangent.x + cos * sample.tangent.y,
-            );
-            let variance = sample.lateral_variance_m2 + params.lane_sigma_m.powi(2) + ALIGNMENT_SIGMA_M.powi(2);
-            let near = lines.near(&place, params.gate_m + params.line_knot_m);
-            let candidates = near.into_iter().filter_map(|(line, knot)| {
-                let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
-                let tangent = lines.lines[line].tangent(knot).xy();
-                let parallel = direction.dot(&tangent).abs() >= LEAST_COSINE * direction.norm() * tangent.norm();
-                let within = across_m.abs() <= params.gate_m && height_m.abs() <= params.gate_height_m;
-                (parallel && within && !is_taken(line, parameter)).then(|| Candidate {
-                    line,
-                    parameter,
-                    cost: 0.5 * across_m * across_m / variance + cost_of_category(line),
-                })
-            });
-            candidates.collect()
-        })
-        .collect();
-    runs(&candidates)
+    let mut agreement = BTreeMap::new();
+    let mut cost_of_category = |line: usize| {
+        let cost = || category_cost(&lane.lane.category_posterior, lines.lines[line].posterior());
+        *agreement.entry(line).or_insert_with(cost)
+    };
+    let candidates = lane.samples.iter().map(|sample| {
+        let place = correction.apply(&sample.map, sample.arc_m);
+        let direction = correction.turn(&sample.tangent, sample.arc_m).xy();
+        let variance = sample.lateral_variance_m2 + ALIGNMENT_SIGMA_M.powi(2);
+        let near = lines.near(&place, params.gate_m + params.line_knot_m);
+        let candidates = near.into_iter().filter_map(|(line, knot)| {
+            let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
+            let tangent = lines.lines[line].tangent(knot).xy();
+            let parallel = direction.dot(&tangent).abs() >= LEAST_COSINE * direction.norm() * tangent.norm();
+            let within = across_m.abs() <= params.gate_m && height_m.abs() <= params.gate_height_m;
+            (parallel && within && !is_taken(line, parameter)).then(|| Candidate {
+                line,
+                parameter,
+                cost: 0.5 * across_m * across_m / variance + cost_of_category(line),
+            })
+        });
+        candidates.collect()
+    });
+    runs(&candidates.collect::<Vec<Vec<Candidate>>>())
+}
+
+/// Runs of all lanes of a pass. Where two lanes want one stretch of a line, the one that fits better has it.
+pub(super) fn match_lanes(
+    lanes: &[PreparedLane<'_>],
+    correction: &Correction,
+    lines: &Lines,
+    params: &FleetParams,
+) -> Vec<Vec<Run>> {
+    let mut matched: Vec<Vec<Run>> =
+        lanes.iter().map(|lane| match_lane(lane, correction, lines, &|_, _| false, params)).collect();
+    let mut order: Vec<usize> = (0..lanes.len()).collect();
+    order.sort_by(|a, b| misfit(&matched[*a]).total_cmp(&misfit(&matched[*b])).then(a.cmp(b)));
+    let mut taken: Vec<Run> = Vec::new();
+    for lane in order {
+        if matched[lane].iter().any(|run| taken.iter().any(|other| overlap(run, other))) {
+            let is_taken =
+                |line: usize, parameter: f64| taken.iter().any(|run| run.line == line && covers(run, parameter));
+            matched[lane] = match_lane(&lanes[lane], correction, lines, &is_taken, params);
+        }
+        taken.extend(matched[lane].iter().cloned());
+    }
+    matched
+}
+
+/// How badly a lane fits its lines: the mean cost of a sample, less for a long run.
+fn misfit(runs: &[Run]) -> f64 {
+    let samples: usize = runs.iter().map(|run| run.parameters.len()).sum();
+    let cost: f64 = runs.iter().map(|run| run.cost * run.parameters.len() as f64).sum();
+    cost / samples.max(1) as f64 - 0.14 * (samples as f64).sqrt()
+}
+
+fn covers(run: &Run, parameter: f64) -> bool {
+    let (low, high) = run.ends();
+    parameter > low - 0.5 && parameter < high + 0.5
+}
+
+fn overlap(a: &Run, b: &Run) -> bool {
+    let ((a_low, a_high), (b_low, b_high)) = (a.ends(), b.ends());
+    a.line == b.line && a_low < b_high + 0.5 && b_low < a_high + 0.5
+}
+
+impl Run {
+    /// Lowest and highest parameter on the line.
+    pub(super) fn ends(&self) -> (f64, f64) {
+        let (first, last) = (self.parameters[0], self.parameters[self.parameters.len() - 1]);
+        (first.min(last), first.max(last))
+    }
+
+    /// Whether the lane runs in the line's direction.
+    pub(super) fn is_forward(&self) -> bool {
+        self.parameters[self.parameters.len() - 1] >= self.parameters[0]
+    }
 }
 
 /// Foot point of a place on a line: parameter, distance across (to the left), height above.

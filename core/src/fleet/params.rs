@@ -21,6 +21,8 @@ pub struct FleetParams {
     pub gnss_shape_share: f64,
     /// Fixes closer together than this are one witness of the shape of the way, metres.
     pub gnss_correlation_m: f64,
+    /// Offset from the median at which the robust weight of a fix has fallen to a quarter, metres.
+    pub gnss_robust_scale_m: f64,
     /// Errors of a lane closer together than this are one witness, metres.
     pub lane_correlation_m: f64,
     /// Least standard deviation of a drive's lane beside its covariance, across, metres.
@@ -33,6 +35,12 @@ pub struct FleetParams {
     pub gate_height_m: f64,
     /// Residual at which a robust weight has fallen to a quarter, metres.
     pub robust_scale_m: f64,
+    /// Median distance of a drive's lanes from the lines that they lie on above which it is kept apart, metres.
+    pub most_misfit_m: f64,
+    /// Drives that are kept apart at least; the younger ones.
+    pub drives_apart: usize,
+    /// Drives that are folded at once; the oldest.
+    pub drives_per_fold: usize,
     /// Rounds of solving and matching.
     pub rounds: usize,
     /// Existence of a drive's lane below which it says nothing.
@@ -51,7 +59,7 @@ impl Default for FleetParams {
     fn default() -> Self {
         Self {
             correction_knot_m: 20.0,
-            sample_m: 1.5,
+            sample_m: 3.0,
             line_knot_m: 3.0,
             odometry_sigma_m: 0.015,
             odometry_sigma_rad: 0.0005,
@@ -59,13 +67,17 @@ impl Default for FleetParams {
             gnss_bias_sigma_m: 1.0,
             gnss_shape_share: 0.3,
             gnss_correlation_m: 100.0,
+            gnss_robust_scale_m: 2.0,
             lane_correlation_m: 30.0,
             lane_sigma_m: 0.1,
             lane_sigma_height_m: 0.1,
             gate_m: 1.4,
             gate_height_m: 3.0,
             robust_scale_m: 0.3,
-            rounds: 3,
+            most_misfit_m: 0.35,
+            drives_apart: 16,
+            drives_per_fold: 16,
+            rounds: 2,
             least_existence: 0.5,
             most_lateral_sigma_m: 0.4,
             bridged_knots: 2,

@@ -10,7 +10,10 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::{correction::Correction, line::Lines, prepared::PreparedDrive};
+use serde::{Deserialize, Serialize};
+
+use super::{correction::Correction, line::Lines, prepared::PreparedPass};
+use crate::sensor::Sensor;
 
 /// What a drive says of a knot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,8 +40,6 @@ const AHEAD_M: std::ops::Range<f64> = 5.0..28.0;
 const SIDE_M: f64 = 9.0;
 /// Places of the way from which a knot must be in view.
 pub(super) const LEAST_VIEWS: u16 = 3;
-/// Every how many points of a trajectory one is looked at.
-const STRIDE: usize = 1;
 
 /// How one drive had each knot in view.
 #[derive(Clone, Debug)]
@@ -48,17 +49,19 @@ pub(super) struct Views {
 }
 
 /// Belief that a knot is there.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Belief {
     pub(super) probability: f64,
 }
 
-impl Belief {
+impl Default for Belief {
     /// Before any drive.
-    pub(super) fn new() -> Self {
+    fn default() -> Self {
         Self { probability: 0.5 }
     }
+}
 
+impl Belief {
     /// Takes what the next drive says.
     pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64) {
         let coming = self.probability * (1.0 - HAZARD) + (1.0 - self.probability) * HAZARD;
@@ -71,11 +74,10 @@ impl Belief {
     }
 }
 
-/// Which knots a drive had in view.
-pub(super) fn views(drive: &PreparedDrive<'_>, correction: &Correction, lines: &Lines) -> Views {
+/// Which knots a pass had in view.
+pub(super) fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Correction, lines: &Lines) -> Views {
     let mut of: Vec<Vec<(u16, f32)>> = lines.lines.iter().map(|line| vec![(0, f32::MAX); line.points.len()]).collect();
-    let sensor = &drive.contribution.sensor;
-    for point in drive.contribution.trajectory.iter().step_by(STRIDE) {
+    for point in pass.way {
         let place = correction.apply(&point.position, point.arc_m);
         let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
         let middle = place + Vector3::new(cos, sin, 0.0) * (0.5 * (AHEAD_M.start + AHEAD_M.end));
@@ -86,7 +88,7 @@ pub(super) fn views(drive: &PreparedDrive<'_>, correction: &Correction, lines: &
             if !AHEAD_M.contains(&ahead) || left.abs() > SIDE_M || offset.z.abs() > 3.0 {
                 return;
             }
-            if sensor.sees(&Point3::new(ahead, left, offset.z)) {
+            if sensor.sees(&Point3::new(ahead, left, offset.z)) && !point.hides(ahead, left, sensor) {
                 let (views, side_m) = &mut of[line][knot];
                 *views += 1;
                 #[expect(clippy::cast_possible_truncation, reason = "metres to the side")]
@@ -103,8 +105,10 @@ mod tests {
     use super::*;
 
     fn after(evidence: &[Evidence]) -> f64 {
-        let mut belief = Belief::new();
-        evidence.iter().for_each(|evidence| belief.hear(*evidence, 2.0));
+        let mut belief = Belief::default();
+        for evidence in evidence {
+            belief.hear(*evidence, 2.0);
+        }
         belief.probability
     }
 

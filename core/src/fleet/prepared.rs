@@ -1,4 +1,10 @@
-//! A contribution made ready: its fixes in the shared frame, its lanes as samples that know from where they were seen.
+//! A contribution made ready: its fixes in the shared frame, and its lanes, pass by pass, as samples that know from where
+//! they were seen.
+//!
+//! A pass is a stretch of the way that does not come back to itself. A drive that does is several witnesses of the same road, as
+//! different drives would be, with one correction: that is how its loops close.
+
+use std::ops::Range;
 
 use nalgebra::{Point3, Vector2, Vector3};
 
@@ -9,18 +15,33 @@ use super::{
 };
 use crate::{
     geometry::georeference::{Anchor, Wgs84},
-    lane_map::{EndRule, MapLane},
+    lane_map::{ControlPoint, EndRule, MapLane},
     spline::curve::Curve,
 };
+
+/// What of a drive holds its correction: fixes, and odometry between knots.
+#[derive(Clone, Debug)]
+pub(super) struct Restraints {
+    pub(super) fixes: Vec<SharedFix>,
+    /// Standard deviations of what all fixes have in common, horizontally and in height, metres.
+    pub(super) bias_sigma_m: [f64; 2],
+    /// Odometry's variances between knot `i` and `i + 1` of the correction.
+    pub(super) steps: Vec<OdometryStep>,
+}
 
 /// A contribution in the form that alignment reads.
 #[derive(Debug)]
 pub(super) struct PreparedDrive<'a> {
     pub(super) contribution: &'a Contribution,
-    pub(super) fixes: Vec<SharedFix>,
+    pub(super) restraints: Restraints,
+    pub(super) passes: Vec<PreparedPass<'a>>,
+}
+
+/// A stretch of a drive that does not come back to itself.
+#[derive(Debug)]
+pub(super) struct PreparedPass<'a> {
+    pub(super) way: &'a [TrajectoryPoint],
     pub(super) lanes: Vec<PreparedLane<'a>>,
-    /// Odometry's variances between knot `i` and `i + 1` of the correction.
-    pub(super) steps: Vec<OdometryStep>,
 }
 
 /// A GNSS fix in the shared frame.
@@ -31,8 +52,8 @@ pub(super) struct SharedFix {
     pub(super) map: Point3<f64>,
     /// Where the receiver put it.
     pub(super) shared: Point3<f64>,
-    pub(super) horizontal_sigma_m: f64,
-    pub(super) vertical_sigma_m: f64,
+    /// Standard deviations of what it has not in common with others, horizontally and in height, metres.
+    pub(super) sigma_m: [f64; 2],
 }
 
 /// What odometry is off by between two knots.
@@ -43,10 +64,11 @@ pub(super) struct OdometryStep {
     pub(super) height_m2: f64,
 }
 
+/// A lane, or as much of it as one pass saw.
 #[derive(Debug)]
 pub(super) struct PreparedLane<'a> {
     pub(super) lane: &'a MapLane,
-    pub(super) curve: Curve<'a, [crate::lane_map::ControlPoint]>,
+    pub(super) curve: Curve<'a, [ControlPoint]>,
     pub(super) samples: Vec<LaneSample>,
 }
 
@@ -65,15 +87,24 @@ pub(super) struct LaneSample {
     pub(super) height_variance_m2: f64,
 }
 
+/// Way after which coming near an earlier place is coming back, metres.
+const LEAST_LOOP_M: f64 = 150.0;
+/// Distance from an earlier place that is near, metres.
+const NEAR_M: f64 = 30.0;
+
 impl<'a> PreparedDrive<'a> {
     pub(super) fn new(contribution: &'a Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
-        let fixes = contribution.trajectory.iter().filter_map(|point| shared_fix(point, anchor)).collect();
-        let usable = |lane: &&MapLane| lane.existence >= params.least_existence;
-        let lanes = contribution.lanes.iter().filter(usable);
-        let lanes = lanes.filter_map(|lane| PreparedLane::new(lane, &contribution.trajectory, params)).collect();
-        let knots = knot_indices(&contribution.trajectory, params.correction_knot_m);
-        let steps = knots.windows(2).map(|pair| step(&contribution.trajectory[pair[0]..=pair[1]], params)).collect();
-        Self { contribution, fixes, lanes, steps }
+        let trajectory = &contribution.trajectory;
+        let passes: Vec<&[TrajectoryPoint]> = passes(trajectory).into_iter().map(|range| &trajectory[range]).collect();
+        let mut prepared: Vec<PreparedPass<'_>> =
+            passes.iter().map(|way| PreparedPass { way, lanes: Vec::new() }).collect();
+        for lane in contribution.lanes.iter().filter(|lane| lane.existence >= params.least_existence) {
+            let Some(lane) = PreparedLane::new(lane, trajectory, params) else { continue };
+            for pass in &mut prepared {
+                pass.lanes.extend(lane.seen_on(pass.way, params));
+            }
+        }
+        Self { contribution, restraints: Restraints::new(trajectory, anchor, params), passes: prepared }
     }
 
     /// The correction that puts the drive's frame into the shared one as a whole.
@@ -97,6 +128,24 @@ impl<'a> PreparedDrive<'a> {
     }
 }
 
+impl Restraints {
+    fn new(trajectory: &[TrajectoryPoint], anchor: &Anchor, params: &FleetParams) -> Self {
+        let mut fixes: Vec<SharedFix> = trajectory.iter().filter_map(|point| shared_fix(point, anchor)).collect();
+        let mean = |axis: usize| fixes.iter().map(|fix| fix.sigma_m[axis]).sum::<f64>() / fixes.len().max(1) as f64;
+        let bias_sigma_m = [0, 1].map(|axis| mean(axis).max(params.gnss_bias_sigma_m));
+        // Fixes near each other share what they are off by: so many witnesses there are of the shape of the way.
+        let length_m = fixes.last().map_or(0.0, |last| last.arc_m - fixes[0].arc_m);
+        let witnesses = length_m / params.gnss_correlation_m + 1.0;
+        let deflation = (fixes.len() as f64 / witnesses).max(1.0).sqrt();
+        for fix in &mut fixes {
+            fix.sigma_m = fix.sigma_m.map(|sigma_m| params.gnss_shape_share * sigma_m * deflation);
+        }
+        let knots = knot_indices(trajectory, params.correction_knot_m);
+        let steps = knots.windows(2).map(|pair| step(&trajectory[pair[0]..=pair[1]], params)).collect();
+        Self { fixes, bias_sigma_m, steps }
+    }
+}
+
 impl<'a> PreparedLane<'a> {
     fn new(lane: &'a MapLane, trajectory: &[TrajectoryPoint], params: &FleetParams) -> Option<Self> {
         let curve = Curve::new(lane.control_points.as_slice(), EndRule::Reflected)?;
@@ -114,19 +163,48 @@ impl<'a> PreparedLane<'a> {
             let tangent = curve.derivative(parameter).normalize();
             let index = walk_to_nearest(seen_from, &map, nearest);
             nearest = Some(index);
-            let (lateral_variance_m2, height_variance_m2) = variances(lane, parameter, &tangent);
+            let (lateral_m2, height_m2) = variances(lane, parameter, &tangent);
             LaneSample {
                 parameter,
                 map,
                 tangent,
                 arc_m: seen_from[index].arc_m,
-                lateral_variance_m2,
-                height_variance_m2,
+                lateral_variance_m2: lateral_m2 + params.lane_sigma_m.powi(2),
+                height_variance_m2: height_m2 + params.lane_sigma_height_m.powi(2),
             }
         });
         let samples: Vec<LaneSample> = samples.collect();
         samples.iter().all(|sample| sample.tangent.x.is_finite()).then_some(Self { lane, curve, samples })
     }
+
+    /// The runs of samples that were seen from a stretch of the way, each as a lane.
+    fn seen_on(&self, way: &[TrajectoryPoint], params: &FleetParams) -> Vec<Self> {
+        let (from, to) = (way[0].arc_m, way[way.len() - 1].arc_m);
+        let on_it = |sample: &LaneSample| sample.arc_m >= from && sample.arc_m <= to;
+        let least = count_of(params.shortest_lane_m / params.sample_m).max(2);
+        let runs = self.samples.chunk_by(|a, b| on_it(a) == on_it(b));
+        let runs = runs.filter(|run| on_it(&run[0]) && run.len() >= least);
+        runs.map(|run| Self { lane: self.lane, curve: self.curve, samples: run.to_vec() }).collect()
+    }
+}
+
+/// Cuts a way where it comes back to itself.
+fn passes(trajectory: &[TrajectoryPoint]) -> Vec<Range<usize>> {
+    const STRIDE: usize = 3;
+    let mut passes = Vec::new();
+    let mut start = 0;
+    for (index, point) in trajectory.iter().enumerate() {
+        let comes_back = trajectory[start..index].iter().step_by(STRIDE).any(|earlier| {
+            point.arc_m - earlier.arc_m > LEAST_LOOP_M
+                && (point.position - earlier.position).xy().norm_squared() < NEAR_M * NEAR_M
+        });
+        if comes_back {
+            passes.push(start..index);
+            start = index;
+        }
+    }
+    passes.push(start..trajectory.len());
+    passes
 }
 
 fn shared_fix(point: &TrajectoryPoint, anchor: &Anchor) -> Option<SharedFix> {
@@ -136,12 +214,11 @@ fn shared_fix(point: &TrajectoryPoint, anchor: &Anchor) -> Option<SharedFix> {
         arc_m: point.arc_m,
         map: point.position,
         shared: anchor.enu_from_wgs84(&place),
-        horizontal_sigma_m: fix.horizontal_sigma_m,
-        vertical_sigma_m: fix.vertical_sigma_m,
+        sigma_m: [fix.horizontal_sigma_m, fix.vertical_sigma_m],
     })
 }
 
-/// Indices of the trajectory points at which a correction has knots: the first, the last, and one every `spacing_m`.
+/// Indices of the trajectory points at which a correction has knots: the first, and one every `spacing_m`.
 fn knot_indices(trajectory: &[TrajectoryPoint], spacing_m: f64) -> Vec<usize> {
     let mut knots = vec![0];
     for (index, point) in trajectory.iter().enumerate() {

@@ -49,6 +49,7 @@ impl Trace {
             motion_variance_m2: std::mem::take(&mut self.motion_variance_m2),
             turn_variance_rad2: std::mem::take(&mut self.turn_variance_rad2),
             fix: frame.gnss().copied(),
+            hidden: frame.occlusions().to_vec(),
         });
     }
 

@@ -1,0 +1,126 @@
+//! The base: what is left of drives that were folded.
+//!
+//! Its lines keep the sum of the information of all of them at each knot, so that the mean of base and a younger drive is the
+//! mean of all. In alignment it is one more drive: it may be shifted as a whole, held where it is by the GNSS biases of its
+//! drives, whose mean has the variance `s_b^2 / n`; and it is turned by nothing.
+
+use nalgebra::Point3;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    correction::{Correction, CorrectionKnot},
+    fusion::Fusion,
+    line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
+    params::FleetParams,
+    prepared::{Restraints, SharedFix, normal_of},
+};
+
+/// Drives that were folded.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Base {
+    drives: u32,
+    lines: Vec<BaseLine>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct BaseLine {
+    id: FusedLaneId,
+    category_votes: Vec<f64>,
+    record: LineRecord,
+    knots: Vec<BaseKnot>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct BaseKnot {
+    place: Point3<f64>,
+    lateral_variance_m2: f64,
+    height_variance_m2: f64,
+    record: KnotRecord,
+}
+
+impl Base {
+    /// Number of drives in it.
+    #[must_use]
+    pub fn drives(&self) -> usize {
+        self.drives as usize
+    }
+
+    /// Its lines, on which younger drives are laid; it is number `drive` among the corrections.
+    pub(super) fn lines(&self, drive: usize) -> Lines {
+        let mut lines = Lines::default();
+        for base in &self.lines {
+            let mut line = Line::new(base.id);
+            line.record = base.record;
+            line.vote(&base.category_votes, 1.0);
+            for knot in &base.knots {
+                let witness = Witness {
+                    drive,
+                    pass: BASE,
+                    lane: 0,
+                    map: knot.place,
+                    arc_m: 0.0,
+                    lateral_variance_m2: knot.lateral_variance_m2,
+                    height_variance_m2: knot.height_variance_m2,
+                    share: 1.0,
+                };
+                line.push(knot.place, Knot { witnesses: vec![witness], record: knot.record });
+            }
+            lines.lines.push(line);
+        }
+        lines.index();
+        lines
+    }
+
+    /// What holds it where it is: fixes at the corners of its lines.
+    pub(super) fn restraints(&self, params: &FleetParams) -> Restraints {
+        /// Of the corners to each other: the base is stiff.
+        const STIFF_M: f64 = 0.01;
+        let places = || self.lines.iter().flat_map(|line| line.knots.iter().map(|knot| knot.place));
+        let low = places().fold(Point3::from([f64::INFINITY; 3]), |low, place| low.inf(&place));
+        let high = places().fold(Point3::from([f64::NEG_INFINITY; 3]), |high, place| high.sup(&place));
+        let corners = [(low.x, low.y), (high.x, low.y), (low.x, high.y), (high.x, high.y)];
+        let fix = |(x, y)| {
+            let place = Point3::new(x, y, 0.0);
+            SharedFix { arc_m: 0.0, map: place, shared: place, sigma_m: [STIFF_M; 2] }
+        };
+        let fixes = if self.lines.is_empty() { Vec::new() } else { corners.into_iter().map(fix).collect() };
+        let sigma_m = params.gnss_bias_sigma_m.max(1.5) / f64::from(self.drives.max(1)).sqrt();
+        Restraints { fixes, bias_sigma_m: [sigma_m; 2], steps: Vec::new() }
+    }
+}
+
+impl Correction {
+    /// The correction of what lies in the shared frame already.
+    pub(super) fn identity() -> Self {
+        let origin = Point3::origin();
+        Self { knots: vec![CorrectionKnot { arc_m: 0.0, map: origin, shared: origin, yaw_rad: 0.0 }] }
+    }
+}
+
+impl Fusion<'_> {
+    /// Folds the drives into the base.
+    pub(super) fn into_base(self, before: &Base) -> Base {
+        let beliefs = self.beliefs();
+        let mut lines = Vec::with_capacity(self.lines.lines.len());
+        for (index, (line, beliefs)) in self.lines.lines.iter().zip(&beliefs).enumerate() {
+            let knots = (0..line.points.len()).map(|knot| {
+                let normal = normal_of(&line.tangent(knot));
+                let mean = line.mean_offset(knot, &normal, &self.corrections, self.params);
+                BaseKnot {
+                    place: line.points[knot],
+                    lateral_variance_m2: 1.0 / mean.across_information.max(1e-6),
+                    height_variance_m2: 1.0 / mean.height_information.max(1e-6),
+                    record: KnotRecord { drives: line.knots[knot].drives(), belief: beliefs[knot] },
+                }
+            });
+            lines.push(BaseLine {
+                id: line.id,
+                category_votes: line.category_votes.clone(),
+                record: self.record_of(index),
+                knots: knots.collect(),
+            });
+        }
+        let placed = self.placed.iter().filter(|placed| **placed).count();
+        Base { drives: before.drives + u32::try_from(placed).unwrap_or(u32::MAX), lines }
+    }
+}

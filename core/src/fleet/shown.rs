@@ -1,0 +1,131 @@
+//! What of the lines is shown: stretches that are there, and whose place is known.
+
+use std::{collections::BTreeSet, ops::Range};
+
+use super::{
+    base::Base,
+    fusion::{FusedDrive, FusedMap, Fusion},
+    line::{BASE, FusedLane, FusedLaneId, FusedPoint, Line, LineRecord},
+    params::FleetParams,
+    persistence::{Belief, Evidence, LEAST_VIEWS, views},
+    prepared::normal_of,
+};
+use crate::category::Category;
+
+impl Fusion<'_> {
+    /// Probability of each knot of each line to be there.
+    pub(super) fn beliefs(&self) -> Vec<Vec<Belief>> {
+        let of_line = |line: &Line| line.knots.iter().map(|knot| knot.record.belief).collect();
+        let mut beliefs: Vec<Vec<Belief>> = self.lines.lines.iter().map(of_line).collect();
+        for (drive, number, pass) in self.passes() {
+            let sensor = &self.drives[drive].contribution.sensor;
+            let views = views(pass, sensor, &self.corrections[drive], &self.lines);
+            for ((line, beliefs), views) in self.lines.lines.iter().zip(&mut beliefs).zip(&views.of) {
+                for ((knot, belief), (views, side_m)) in line.knots.iter().zip(beliefs).zip(views) {
+                    if knot.witnesses.iter().any(|witness| witness.pass == number) {
+                        belief.hear(Evidence::Seen, f64::from(*side_m));
+                    } else if *views >= LEAST_VIEWS {
+                        belief.hear(Evidence::Missed, f64::from(*side_m));
+                    }
+                }
+            }
+        }
+        beliefs
+    }
+
+    /// What is known of a line from all drives, those that were folded among them.
+    pub(super) fn record_of(&self, index: usize) -> LineRecord {
+        let line = &self.lines.lines[index];
+        let mut record = line.record;
+        let lanes: BTreeSet<(usize, usize, usize)> = line
+            .knots
+            .iter()
+            .flat_map(|knot| &knot.witnesses)
+            .filter(|witness| witness.pass != BASE)
+            .map(|witness| (witness.drive, witness.pass, witness.lane))
+            .collect();
+        let drives: BTreeSet<usize> = lanes.iter().map(|(drive, ..)| *drive).collect();
+        record.drives += u32::try_from(drives.len()).unwrap_or(u32::MAX);
+        let mut counted = BTreeSet::new();
+        for (drive, number, lane) in lanes {
+            let Some((_, _, pass)) = self.passes().find(|(_, other, _)| *other == number) else { continue };
+            let lane = pass.lanes[lane].lane;
+            if counted.insert((drive, lane.id)) {
+                record.observations += u64::from(lane.observations);
+            }
+            record.first_seen = Some(record.first_seen.map_or(lane.first_seen, |first| first.min(lane.first_seen)));
+            record.last_seen = Some(record.last_seen.map_or(lane.last_seen, |last| last.max(lane.last_seen)));
+        }
+        record
+    }
+
+    /// The map as it is shown.
+    pub(super) fn into_map(self, base: &Base) -> FusedMap {
+        let beliefs = self.beliefs();
+        let mut lanes: Vec<FusedLane> = Vec::new();
+        for (index, beliefs) in beliefs.iter().enumerate() {
+            let points = self.points_of(index, beliefs);
+            let stretches = stretches(&points, self.params);
+            if stretches.is_empty() {
+                continue;
+            }
+            let record = self.record_of(index);
+            let pieces = stretches.into_iter().enumerate();
+            lanes.extend(pieces.map(|(stretch, knots)| self.fused_lane(index, stretch, &points[knots], &record)));
+        }
+        lanes.sort_by_key(|lane| lane.id);
+        let drives = self.drives.iter().zip(&self.placed).zip(self.corrections).map(|((drive, placed), correction)| {
+            FusedDrive { drive: drive.contribution.drive, correction: placed.then_some(correction) }
+        });
+        FusedMap { lanes, drives: drives.collect(), folded_drives: u32::try_from(base.drives()).unwrap_or(u32::MAX) }
+    }
+
+    fn points_of(&self, index: usize, beliefs: &[Belief]) -> Vec<FusedPoint> {
+        let line = &self.lines.lines[index];
+        let points = (0..line.points.len()).map(|knot| {
+            let normal = normal_of(&line.tangent(knot));
+            let mean = line.mean_offset(knot, &normal, &self.corrections, self.params);
+            FusedPoint {
+                position: line.points[knot],
+                lateral_sigma_m: mean.across_information.max(1e-6).powf(-0.5),
+                height_sigma_m: mean.height_information.max(1e-6).powf(-0.5),
+                drives: line.knots[knot].drives(),
+                existence: beliefs[knot].probability,
+            }
+        });
+        points.collect()
+    }
+
+    fn fused_lane(&self, index: usize, stretch: usize, points: &[FusedPoint], record: &LineRecord) -> FusedLane {
+        let line = &self.lines.lines[index];
+        let category_posterior = line.posterior().to_vec();
+        let by_probability = |a: &usize, b: &usize| category_posterior[*a].total_cmp(&category_posterior[*b]);
+        let best = (0..category_posterior.len()).max_by(by_probability).unwrap_or(0);
+        FusedLane {
+            id: FusedLaneId { stretch: u32::try_from(stretch).unwrap_or(u32::MAX), ..line.id },
+            category: Category::ALL[best],
+            category_posterior,
+            points: points.to_vec(),
+            drives: record.drives,
+            observations: record.observations,
+            first_seen: record.first_seen.unwrap_or_default(),
+            last_seen: record.last_seen.unwrap_or_default(),
+        }
+    }
+}
+
+/// Runs of knots that are there and whose place is known, of at least the shortest length.
+fn stretches(points: &[FusedPoint], params: &FleetParams) -> Vec<Range<usize>> {
+    let mut stretches: Vec<Range<usize>> = Vec::new();
+    let shown = |point: &FusedPoint| {
+        point.existence >= params.least_existence && point.lateral_sigma_m <= params.most_lateral_sigma_m
+    };
+    for (knot, _) in points.iter().enumerate().filter(|(_, point)| shown(point)) {
+        match stretches.last_mut() {
+            Some(open) if open.end + params.bridged_knots >= knot => open.end = knot + 1,
+            _ => stretches.push(knot..knot + 1),
+        }
+    }
+    stretches.retain(|knots| (knots.len() as f64 - 1.0) * params.line_knot_m >= params.shortest_lane_m);
+    stretches
+}

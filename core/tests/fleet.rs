@@ -1,0 +1,154 @@
+//! What fusion promises, on roads whose truth is known in closed form.
+
+mod roads;
+
+use lanemap_core::fleet::{Base, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto};
+use proptest::prelude::*;
+use roads::{Road, Survey, anchor};
+
+/// Distances of every fused knot from the nearest true line, across, after a shift of the whole map.
+fn misfits_m(map: &FusedMap, road: &Road, shift: nalgebra::Vector2<f64>) -> Vec<f64> {
+    let points = map.lanes.iter().flat_map(|lane| &lane.points);
+    let mut misfits: Vec<f64> = points
+        .map(|point| {
+            let (station_m, left_m) = road.locate(point.position.coords.xy() + shift);
+            road.nearest_line_m(station_m, left_m)
+        })
+        .collect();
+    misfits.sort_by(f64::total_cmp);
+    misfits
+}
+
+fn quantile(sorted: &[f64], share: f64) -> f64 {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index")]
+    sorted[((sorted.len() - 1) as f64 * share) as usize]
+}
+
+/// The shift that lays the map best on the truth, by a search.
+fn best_shift(map: &FusedMap, road: &Road) -> nalgebra::Vector2<f64> {
+    let mut best = nalgebra::Vector2::zeros();
+    let mut step = 0.5;
+    let cost =
+        |shift: nalgebra::Vector2<f64>| misfits_m(map, road, shift).iter().map(|misfit| misfit.min(1.0)).sum::<f64>();
+    while step > 0.01 {
+        let around = (-3..=3).flat_map(|x| (-3..=3).map(move |y| nalgebra::Vector2::new(f64::from(x), f64::from(y))));
+        let next = around.map(|offset| best + offset * step).min_by(|a, b| cost(*a).total_cmp(&cost(*b)));
+        best = next.unwrap_or(best);
+        step *= 0.5;
+    }
+    best
+}
+
+fn fused(contributions: &[Contribution]) -> FusedMap {
+    fuse(contributions, &anchor(), &FleetParams::default())
+}
+
+fn assert_same(a: &FusedMap, b: &FusedMap) {
+    let ids = |map: &FusedMap| map.lanes.iter().map(|lane| lane.id).collect::<Vec<_>>();
+    assert_eq!(ids(a), ids(b));
+    for (a, b) in a.lanes.iter().zip(&b.lanes) {
+        assert_eq!(a.points.len(), b.points.len());
+        for (a, b) in a.points.iter().zip(&b.points) {
+            assert!((a.position - b.position).norm() <= 1e-3);
+        }
+    }
+}
+
+#[test]
+fn ten_drives_with_gnss_biases_of_a_metre_and_a_half_agree_to_decimetres() {
+    let road = Road::bend(600.0);
+    let drives = Survey::of(&road, 7).drives(10);
+    let map = fused(&drives);
+    assert_eq!(map.drives.iter().filter(|drive| drive.correction.is_some()).count(), 10);
+    assert_eq!(map.lanes.len(), road.lines.len());
+    let misfits = misfits_m(&map, &road, best_shift(&map, &road));
+    assert!(quantile(&misfits, 0.5) <= 0.06 && quantile(&misfits, 0.95) <= 0.15, "{:?}", quantile(&misfits, 0.95));
+}
+
+/// Mean square of how far the knots lie to the left of the line that their name tells.
+fn absolute_square_m2(map: &FusedMap, road: &Road) -> f64 {
+    let squares = map.lanes.iter().flat_map(|lane| {
+        let (line_m, _) = road.lines[usize::try_from(lane.id.lane.0).unwrap_or(1) - 1];
+        lane.points.iter().map(move |point| (road.locate(point.position.coords.xy()).1 - line_m).powi(2))
+    });
+    let squares: Vec<f64> = squares.collect();
+    squares.iter().sum::<f64>() / squares.len() as f64
+}
+
+#[test]
+fn the_absolute_error_falls_with_the_square_root_of_the_number_of_drives() {
+    const SEEDS: u64 = 40;
+    let road = Road::bend(200.0);
+    let rms_m = |count: usize| {
+        let squares =
+            (0..SEEDS).map(|seed| absolute_square_m2(&fused(&Survey::of(&road, 100 + seed).drives(count)), &road));
+        (squares.sum::<f64>() / SEEDS as f64).sqrt()
+    };
+    let (one, nine) = (rms_m(1), rms_m(9));
+    assert!((nine * 3.0 / one - 1.0).abs() < 0.25, "{one} m with one drive, {nine} m with nine");
+}
+
+#[test]
+fn folding_older_drives_moves_no_line_by_more_than_a_few_centimetres() {
+    let road = Road::bend(300.0);
+    let drives = Survey::of(&road, 3).drives(20);
+    let ordered = by_seniority(&drives);
+    let params = FleetParams::default();
+    let apart = fuse_onto(&Base::default(), &ordered, &anchor(), &params);
+    let base = fold(&Base::default(), &ordered[..10], &anchor(), &params);
+    assert_eq!(base.drives(), 10);
+    let folded = fuse_onto(&base, &ordered[10..], &anchor(), &params);
+    assert_eq!(apart.lanes.len(), folded.lanes.len());
+    let (before, after) = (best_shift(&apart, &road), best_shift(&folded, &road));
+    assert!((before - after).norm() < 0.15, "{before} {after}");
+    let misfits = misfits_m(&folded, &road, after);
+    assert!(quantile(&misfits, 0.95) <= 0.15);
+}
+
+#[test]
+fn a_drive_that_is_taken_out_leaves_the_map_of_the_others() {
+    let road = Road::bend(200.0);
+    let drives = Survey::of(&road, 5).drives(5);
+    let mut without = drives.clone();
+    without.remove(2);
+    let map = fused(&without);
+    assert!(map.drives.iter().all(|drive| drive.drive != drives[2].drive));
+    assert_same(&map, &fused(&without.iter().rev().cloned().collect::<Vec<_>>()));
+}
+
+#[test]
+fn a_drive_far_off_or_warped_does_not_spoil_the_map_of_the_others() {
+    let road = Road::bend(400.0);
+    let clean = fused(&Survey::of(&road, 11).drives(14));
+    let mut drives = Survey::of(&road, 11).drives(14);
+    let poisoned = Survey { bias_sigma_m: 40.0, ..Survey::of(&road, 12) }.drives(6);
+    drives.extend(
+        poisoned
+            .into_iter()
+            .enumerate()
+            .map(|(index, drive)| Contribution { drive: DriveId(1000 + index as u64), ..drive }),
+    );
+    let map = fused(&drives);
+    let p95 = |map: &FusedMap| {
+        let near: Vec<f64> =
+            misfits_m(map, &road, best_shift(map, &road)).into_iter().filter(|misfit| *misfit < 1.0).collect();
+        quantile(&near, 0.95)
+    };
+    assert!(p95(&map) <= 1.2 * p95(&clean).max(0.05), "{} {}", p95(&map), p95(&clean));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 12, ..ProptestConfig::default() })]
+    #[test]
+    fn any_order_and_any_duplication_give_the_same_map(
+        seed in 0..1000_u64,
+        order in Just((0..5).collect::<Vec<usize>>()).prop_shuffle(),
+        again in proptest::collection::vec(0..5_usize, 0..4),
+    ) {
+        let road = Road::bend(120.0);
+        let drives = Survey::of(&road, seed).drives(5);
+        let expected = fused(&drives);
+        let shuffled: Vec<Contribution> = order.iter().chain(&again).map(|index| drives[*index].clone()).collect();
+        assert_same(&fused(&shuffled), &expected);
+    }
+}

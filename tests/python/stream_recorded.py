@@ -76,6 +76,7 @@ session = lanemap.Session(
     keep_alive_s=options.keep_alive_s,
 )
 poses = session.poses()
+gaps = session.gaps()
 with session:
     for frame in recorded.frames:
         if frame.sequence > (session.last_sequence or 0):
@@ -95,6 +96,7 @@ print(
             "refused": summary.refused,
             "reconnections": summary.reconnections,
             "last_pose": last_pose and last_pose.sequence,
+            "gaps": [[gap.first, gap.last] for gap in gaps],
         }
     )
 )

@@ -12,8 +12,8 @@ use std::{
 };
 
 use lanemap_client::{
-    ClientError, ConnectOptions, Credentials, IdentityFiles, IngestClient, MapClient, Reconnect, Session, SessionStart,
-    SpoolError, SpoolOptions, SpooledDrive, Token, WhenFull,
+    ClientError, ConnectOptions, Credentials, Event, IdentityFiles, IngestClient, MapClient, Reconnect, Session,
+    SessionStart, SpoolError, SpoolOptions, SpooledDrive, Token, WhenFull,
 };
 use lanemap_server::{RunningServer, Server, ServerConfig, config::ZenohMode};
 use lanemap_tests::{
@@ -220,10 +220,17 @@ async fn stream_by_python(url: &str, options: &[String], drive: &Drive, folder: 
     python_report(PythonClient::start(&run), drive).await
 }
 
+/// The numbers that no frame of a drive has, each run of them by its first and its last.
+fn gaps_in(drive: &Drive) -> Vec<(u64, u64)> {
+    let numbers = drive.frames.windows(2).map(|pair| (pair[0].sequence().0, pair[1].sequence().0));
+    numbers.filter(|(before, after)| before + 1 < *after).map(|(before, after)| (before + 1, after - 1)).collect()
+}
+
 async fn python_report(client: PythonClient, drive: &Drive) -> String {
     let report: Value = serde_json::from_str(&client.finish().await).unwrap();
     let last = drive.frames.last().unwrap().sequence().0;
-    assert_eq!((&report["acked"], &report["refused"]), (&last.into(), &0.into()), "{report}");
+    let gaps = json!(gaps_in(drive));
+    assert_eq!((&report["acked"], &report["refused"], &report["gaps"]), (&last.into(), &0.into(), &gaps), "{report}");
     report["session"].as_str().unwrap().to_owned()
 }
 
@@ -405,4 +412,38 @@ async fn a_full_spool_refuses_the_newest_frame_and_the_session_goes_on() {
     let id = session.id().to_owned();
     session.finish().await.unwrap();
     assert_same_map(&service.map(&id).await, &drive);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn numbers_that_no_frame_has_are_told_as_gaps_whatever_the_way() {
+    let service = Service::start().await;
+    let whole = drives::simulated(40, 60);
+    let frames = [&whole.frames[..20], &whole.frames[25..40], &whole.frames[41..]].concat();
+    let drive = Drive { frames, ..whole };
+    let expected = vec![(21, 25), (41, 41)];
+    assert_eq!(gaps_in(&drive), expected);
+    let zenoh = service.zenoh.to_string();
+    for (url, vehicle) in [(service.server.url(), "over gRPC"), (zenoh.clone(), "over zenoh")] {
+        let client = IngestClient::offline(url, ConnectOptions::default()).await.unwrap();
+        let start = SessionStart { vehicle: vehicle.to_owned(), ..drive.start() };
+        let (mut session, mut events) = client.begin_session(start).await.unwrap();
+        for frame in &drive.frames {
+            session.send(frame).await.unwrap();
+        }
+        session.finish().await.unwrap();
+        let mut gaps = Vec::new();
+        while let Some(event) = events.next().await {
+            if let Event::Gap { first, last } = event {
+                gaps.push((first.0, last.0));
+            }
+        }
+        assert_eq!(gaps, expected, "{vehicle}");
+    }
+    for (name, url) in [("python over gRPC", service.server.url()), ("python over zenoh", zenoh)] {
+        let folder = service.path(name);
+        std::fs::create_dir(&folder).unwrap();
+        let options = ["--vehicle".to_owned(), name.to_owned()];
+        // What it prints at the end is compared with the gaps of the drive.
+        timeout(PATIENCE, stream_by_python(&url, &options, &drive, &folder)).await.unwrap();
+    }
 }

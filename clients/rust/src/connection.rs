@@ -223,9 +223,13 @@ impl Task {
             }
             Response::Pose(pose) => self.tell(Event::Pose(Box::new(event::pose(&pose)?))),
             Response::LocalMap(map) => self.tell(Event::LocalMap(event::local_map(&map)?)),
-            // How a stream ends, its transport says.
             // What is missing was never sent, or was sent too late: there is nothing more to send.
-            Response::Ended(_) | Response::Closed(_) | Response::Gap(_) => {}
+            Response::Gap(gap) => self.tell(Event::Gap {
+                first: Sequence(gap.first_missing_sequence),
+                last: Sequence(gap.last_missing_sequence),
+            }),
+            // How a stream ends, its transport says.
+            Response::Ended(_) | Response::Closed(_) => {}
             Response::Accepted(_) => {
                 return Err(ClientError::Protocol("a session was accepted twice".to_owned()));
             }

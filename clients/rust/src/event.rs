@@ -24,6 +24,14 @@ pub enum Event {
     Acked(Sequence),
     /// A frame was refused.
     Refused(v1::Refusal),
+    /// Frames did not come, and the service goes on without them: from here on it refuses them. Frames that are numbered
+    /// without holes, and sent in their order, are never missing.
+    Gap {
+        /// The first number that did not come.
+        first: Sequence,
+        /// The last of them, inclusive.
+        last: Sequence,
+    },
     /// Where the vehicle is.
     Pose(Box<VehiclePose>),
     /// The map around the vehicle.

@@ -123,6 +123,7 @@ async fn collect_refusals(mut events: Events, refusals: Arc<Mutex<Vec<String>>>)
                     refusals.push(refusal.message);
                 }
             }
+            Event::Gap { first, last } => tracing::warn!("frames {} to {} did not come", first.0, last.0),
             Event::Disconnected { reason, retry_in } => {
                 tracing::warn!("the connection broke, trying again in {} ms: {reason}", retry_in.as_millis());
             }

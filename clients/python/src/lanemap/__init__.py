@@ -9,7 +9,7 @@
 A session outlives its connection, and with a spool its process: what is not acked is sent again.
 """
 
-from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
+from ._events import Feed, Gap, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials
 from ._session import Reconnect, Session
 from ._spool import SpoolOptions, SpoolRecovery
@@ -22,6 +22,7 @@ __all__ = [
     "Detection",
     "Feed",
     "FieldOfView",
+    "Gap",
     "GnssFix",
     "LanemapError",
     "Limits",

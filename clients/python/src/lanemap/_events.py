@@ -49,6 +49,17 @@ class Refusal:
     message: str
 
 
+@dataclass(frozen=True)
+class Gap:
+    """Frames that did not come: the service goes on without them, and refuses them from here on. Frames that are numbered
+    without holes, and sent in their order, are never missing."""
+
+    first: int
+    """The first number that did not come."""
+    last: int
+    """The last of them, inclusive."""
+
+
 @dataclass
 class Summary:
     """What became of a drive."""

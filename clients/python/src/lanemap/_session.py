@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from . import _values
 from ._backlog import Backlog, Leaving
-from ._events import Feed, LocalMap, Refusal, Summary, VehiclePose
+from ._events import Feed, Gap, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials, Link, Stream, link_to
 from ._spool import Spool, SpoolOptions, SpoolRecovery
 from ._values import Detection, GnssFix, Limits, Occlusion, Pose, Preset, Sensor
@@ -241,6 +241,10 @@ class Session:
         """Frames that the service refuses, from now on."""
         return self._feed(Refusal)
 
+    def gaps(self) -> Feed[Gap]:
+        """Frames that did not come and that the service no longer waits for, from now on."""
+        return self._feed(Gap)
+
     def __enter__(self) -> Session:
         return self
 
@@ -404,6 +408,8 @@ class Session:
                 self._backlog.refused(sequence)
             self._summary.refused += 1
             self._tell(Refusal(sequence, refusal.field, refusal.value, refusal.limit, refusal.message))
+        elif kind == "gap":
+            self._tell(Gap(answer.gap.first_missing_sequence, answer.gap.last_missing_sequence))
         elif kind == "pose":
             pose = answer.pose
             covariance = _values.covariance_of(pose.covariance)

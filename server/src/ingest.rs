@@ -10,6 +10,7 @@ mod refusal;
 mod upload;
 pub mod zenoh;
 
+pub(crate) use grpc::BoundedIngest;
 pub use grpc::IngestGrpc;
 pub use outbox::{Outbox, OutboxStream};
 pub use refusal::Refusal;

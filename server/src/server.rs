@@ -25,7 +25,7 @@ use crate::{
         reload::{CredentialError, Credentials},
     },
     config::{ConfigError, ServerConfig, ZenohMode},
-    ingest::{IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
+    ingest::{BoundedIngest, IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
     journal::{CommitterThread, Journal, JournalError, JournalHealth, JournalOptions},
     listener,
     map_service::MapGrpc,
@@ -381,10 +381,7 @@ async fn router(
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()?;
     let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone())).send_compressed(CompressionEncoding::Gzip);
-    let ingest = IngestServiceServer::new(ingest)
-        .max_decoding_message_size(config.max_message_bytes)
-        // Not zstd: a sender chooses how much memory unpacking it takes, up to 128 MiB, whatever the limit of a message.
-        .accept_compressed(CompressionEncoding::Gzip);
+    let ingest = BoundedIngest::new(ingest, config.max_message_bytes);
     let routes = Routes::from(serve::router(http))
         .add_service(ingest)
         .add_service(AdminServiceServer::new(admin))

@@ -1,10 +1,13 @@
 //! The gRPC side of ingest: carries messages in and answers out.
 
+mod packed;
+
 use lanemap_proto::v1::{self, ingest_service_server::IngestService};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{OutboxStream, conversation::Conversations};
 use crate::auth::peer_of;
+pub(crate) use packed::BoundedIngest;
 
 /// The ingest service.
 #[derive(Clone)]

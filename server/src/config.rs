@@ -73,7 +73,8 @@ pub struct ServerConfig {
     /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as `lanemap zenoh-access` has
     /// it.
     pub zenoh_trust_router: bool,
-    /// Largest message of a vehicle, bytes, 1 KiB to 1 GiB; a larger one ends its stream.
+    /// Largest message of a vehicle, bytes, 1 KiB to 1 GiB; a larger one ends its stream. One that comes packed may unpack
+    /// to half of it.
     pub max_message_bytes: usize,
     /// Most detections in a frame, at least 1.
     pub max_detections: usize,
@@ -175,7 +176,7 @@ impl Default for ServerConfig {
             max_connections: 8192,
             max_streams_per_connection: 1024,
             max_frames_in_flight: 64,
-            max_bytes_in_flight: 256 * 1024 * 1024,
+            max_bytes_in_flight: 64 * 1024 * 1024,
             reorder_window_frames: 32,
             reorder_wait_ms: 200,
             max_frames_per_commit: 2048,

@@ -33,8 +33,9 @@ impl Actor {
         }
     }
 
-    /// Maps acked frames for the length of a turn.
+    /// Maps acked frames for the length of a turn, behind whatever else is ready to run: what reads, journals and acks is.
     pub(super) async fn map_for(&mut self, turn: MappingTurn) {
+        tokio::task::yield_now().await;
         let began = Instant::now();
         while began.elapsed() < LONGEST_RUN {
             let Some(Arrival { frame, place, .. }) = self.backlog.pop() else { break };
@@ -43,7 +44,6 @@ impl Actor {
         }
         drop(turn);
         self.publish_if_due();
-        tokio::task::yield_now().await;
     }
 
     /// Maps every frame that was acked.

@@ -103,7 +103,8 @@ pub struct ServeArgs {
     /// [env: LANEMAP_ZENOH_TRUST_ROUTER] [default: false]
     #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     zenoh_trust_router: Option<bool>,
-    /// Largest message of a vehicle, bytes; a larger one ends its stream [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
+    /// Largest message of a vehicle, bytes; one that comes packed may unpack to half of it. A larger one ends its stream
+    /// [env: LANEMAP_MAX_MESSAGE_BYTES] [default: 33554432]
     #[arg(long, value_name = "BYTES")]
     max_message_bytes: Option<usize>,
     /// Most detections in a frame [env: LANEMAP_MAX_DETECTIONS] [default: 64]

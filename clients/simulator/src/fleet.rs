@@ -21,6 +21,7 @@ pub mod odometry_drift;
 pub mod poison;
 pub mod receiver;
 pub mod routes;
+pub mod traffic;
 pub mod truth;
 
 use lanemap_core::{
@@ -42,6 +43,7 @@ pub use odometry_drift::OdometryDrift;
 pub use poison::{Poison, PoisonPlan};
 pub use receiver::ReceiverModel;
 pub use routes::FleetRoutes;
+pub use traffic::{OtherVehicle, TrafficModel};
 pub use truth::{FleetTrueLine, FleetTruth};
 
 /// Time of the first frame of the first drive, nanoseconds since the Unix epoch: 1 January 2025, 8:00.
@@ -89,6 +91,8 @@ pub struct FleetScenario {
     pub canyon_share: f64,
     /// The camera.
     pub camera: Camera,
+    /// Other vehicles, which hide parts of the road.
+    pub traffic: TrafficModel,
     /// Drives with gross errors, and drives that lie.
     pub poison: PoisonPlan,
 }
@@ -110,6 +114,7 @@ impl FleetScenario {
             receiver: ReceiverModel::default(),
             canyon_share: 0.0,
             camera: Camera::default(),
+            traffic: TrafficModel::none(),
             poison: PoisonPlan::default(),
         }
     }
@@ -148,6 +153,7 @@ impl FleetScenario {
             interval_ns: DAY_NS / 4,
             routes: FleetRoutes::Random { length_m: 1_000.0 },
             canyon_share: 0.15,
+            traffic: TrafficModel::town(),
             ..Self::on_road(Course::Straight)
         }
     }

@@ -2,11 +2,15 @@
 
 use lanemap_core::{
     Detection, Frame, FrameLimits, FrameParts, Occlusion, Odometry, Pose, Sensor, Sequence, TimestampNs,
-    geometry::pose::yaw_rad,
+    frame::MAX_OCCLUSIONS, geometry::pose::yaw_rad,
 };
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
-use super::{Fleet, poison::Poison};
+use super::{
+    Fleet,
+    poison::Poison,
+    traffic::{OtherVehicle, Traffic},
+};
 use crate::{
     detector::Detector,
     drive::{Path, Route, TrueState, motion::FRAME_RATE_HZ},
@@ -20,6 +24,8 @@ pub struct FleetDrive<'a> {
     fleet: &'a Fleet,
     number: u32,
     route: Route,
+    path: Path,
+    traffic: Traffic,
     poison: Option<Poison>,
     world_from_odometry: Pose,
     states: Vec<TrueState>,
@@ -38,6 +44,8 @@ pub struct FleetFrame {
     pub views: Vec<LineView>,
     /// Where GNSS has the vehicle, in the world.
     pub gnss_world_from_vehicle: Pose,
+    /// The other vehicles about it.
+    pub vehicles: Vec<OtherVehicle>,
 }
 
 /// The frames of a drive, one by one.
@@ -69,7 +77,8 @@ impl<'a> FleetDrive<'a> {
             states.iter().map(|state| world_from_odometry.inverse() * state.world_from_vehicle).collect();
         let more_scale = poison.map_or(0.0, |poison| poison.odometry_scale());
         let odometry = scenario.odometry.apply(&exact, more_scale, &mut seed.stream(Purpose::Odometry, number));
-        Self { fleet, number, route, poison, world_from_odometry, states, fixes, odometry }
+        let traffic = Traffic::draw(&scenario.traffic, &states, &mut seed.stream(Purpose::Traffic, number));
+        Self { fleet, number, route, path, traffic, poison, world_from_odometry, states, fixes, odometry }
     }
 
     /// Number within the fleet, from 0; also the order in time.
@@ -145,11 +154,30 @@ impl Iterator for FleetFrames<'_> {
         let ids = line_ids_ahead(&fleet.network, &drive.route.legs, truth.leg);
         let lines = ids.into_iter().map(|(id, forward)| (fleet.network.line(id), forward));
         let views = views_of(lines, &truth.world_from_vehicle, &self.sensor);
-        let detections = self.detector.observe(&views, 1.0 / FRAME_RATE_HZ);
-        let detections = self.displaced(detections);
-        let parts = drive.parts(index, detections, Vec::new());
-        Some(FleetFrame { frame: valid(parts), truth, views, gnss_world_from_vehicle: drive.fixes[index] })
+        let vehicles = drive.traffic.around(&fleet.network, &drive.route, &drive.path, &drive.states, index);
+        let shadow = |vehicle: &OtherVehicle| vehicle.shadow(&truth.world_from_vehicle, &self.sensor);
+        let shadows: Vec<Occlusion> = vehicles.iter().filter_map(shadow).collect();
+        let told = nearest(vehicles.iter().filter(|vehicle| vehicle.told).filter_map(shadow).collect());
+        let seen = unhidden(self.detector.observe(&views, 1.0 / FRAME_RATE_HZ), &shadows, &self.sensor);
+        let frame = valid(drive.parts(index, self.displaced(seen), told));
+        Some(FleetFrame { frame, truth, views, gnss_world_from_vehicle: drive.fixes[index], vehicles })
     }
+}
+
+/// What is left of detections in the shadows of other vehicles.
+fn unhidden(mut detections: Vec<Detection>, shadows: &[Occlusion], sensor: &Sensor) -> Vec<Detection> {
+    for detection in &mut detections {
+        detection.points_vehicle.retain(|point| !shadows.iter().any(|shadow| shadow.hides(point, sensor)));
+    }
+    detections.retain(|detection| detection.points_vehicle.len() >= 2);
+    detections
+}
+
+/// The nearest of the occlusions, as many as a frame may have.
+fn nearest(mut occlusions: Vec<Occlusion>) -> Vec<Occlusion> {
+    occlusions.sort_by(|a, b| a.range_m.total_cmp(&b.range_m));
+    occlusions.truncate(MAX_OCCLUSIONS);
+    occlusions
 }
 
 impl FleetFrames<'_> {

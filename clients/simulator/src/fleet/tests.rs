@@ -151,3 +151,48 @@ fn a_canyon_in_town_shifts_fixes_by_metres() {
     }
     assert!(jumps >= 12, "{jumps}");
 }
+
+#[test]
+fn nothing_is_detected_behind_another_vehicle_and_the_frame_says_what_is_hidden() {
+    let traffic = TrafficModel { vehicles_per_km: 25.0, ..TrafficModel::town() };
+    let (empty, full) = (FleetScenario { traffic: TrafficModel::none(), ..FleetScenario::small_town(6) }, traffic);
+    let (clear, busy) = (empty.fleet(Seed(5)), FleetScenario { traffic: full, ..empty }.fleet(Seed(5)));
+    let sensor = busy.sensor();
+    let points = |frame: &Frame| frame.detections().iter().map(|line| line.points_vehicle.len()).sum::<usize>();
+    let (mut all, mut left, mut hidden_frames) = (0, 0, 0);
+    for (a, b) in clear.drives().zip(busy.drives()) {
+        for (clear, busy) in a.observed().zip(b.observed()) {
+            assert!(clear.frame.occlusions().is_empty());
+            for detection in busy.frame.detections() {
+                assert!(detection.points_vehicle.iter().all(|point| !busy.frame.hides(point, &sensor)));
+            }
+            all += points(&clear.frame);
+            left += points(&busy.frame);
+            hidden_frames += usize::from(!busy.frame.occlusions().is_empty());
+        }
+    }
+    assert!(hidden_frames > 1_000, "{hidden_frames}");
+    assert!(left * 10 < all * 9 && left * 10 > all * 3, "{left} of {all} points are left");
+}
+
+#[test]
+fn vehicles_keep_to_their_lanes_and_leave_the_ego_vehicle_its_room() {
+    let fleet = FleetScenario { traffic: TrafficModel::town(), ..FleetScenario::straight_road() }.fleet(Seed(2));
+    let (mut counted, mut frames) = (0, 0);
+    for drive in fleet.drives() {
+        for seen in drive.observed() {
+            frames += 1;
+            for vehicle in &seen.vehicles {
+                counted += 1;
+                let place = vehicle.place - seen.truth.world_from_vehicle.translation.vector.xy();
+                assert!(place.coords.norm() > 3.0, "{place}");
+                let lane = (vehicle.place.y / 3.5).floor() + 0.5;
+                assert!((vehicle.place.y - 3.5 * lane).abs() < 1.0, "{}", vehicle.place);
+                let rightwards = vehicle.heading_rad.cos() > 0.0;
+                assert_eq!(rightwards, vehicle.place.y < 0.0, "traffic keeps to the right");
+            }
+        }
+    }
+    let per_km = f64::from(counted) / f64::from(frames) / 0.11 / 4.0;
+    assert!((5.0..14.0).contains(&per_km), "{per_km} vehicles a kilometre and lane");
+}

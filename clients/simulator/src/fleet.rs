@@ -16,6 +16,7 @@
 //! ```
 
 pub mod canyon;
+pub mod changes;
 mod drive;
 pub mod odometry_drift;
 pub mod poison;
@@ -38,6 +39,8 @@ use crate::{
 };
 
 pub use canyon::Canyon;
+use changes::Timeline;
+pub use changes::{ChangeKind, ChangePlan, RoadChange};
 pub use drive::{FleetDrive, FleetFrame, FleetFrames};
 pub use odometry_drift::OdometryDrift;
 pub use poison::{Poison, PoisonPlan};
@@ -95,6 +98,8 @@ pub struct FleetScenario {
     pub traffic: TrafficModel,
     /// Drives with gross errors, and drives that lie.
     pub poison: PoisonPlan,
+    /// How the road changes.
+    pub changes: ChangePlan,
 }
 
 impl FleetScenario {
@@ -116,6 +121,7 @@ impl FleetScenario {
             camera: Camera::default(),
             traffic: TrafficModel::none(),
             poison: PoisonPlan::default(),
+            changes: ChangePlan::none(),
         }
     }
 
@@ -173,7 +179,10 @@ impl FleetScenario {
         };
         let canyons = Canyon::scatter(&network, self.canyon_share, &mut seed.stream(Purpose::Canyons, 0));
         let on_earth = Georeference { anchor: Anchor::new(self.anchor), enu_from_map: Pose::identity() };
-        Fleet { scenario: self, seed, network, canyons, on_earth }
+        let start_of = |drive| start_of(self.interval_ns, drive);
+        let changes = &mut seed.stream(Purpose::Changes, 0);
+        let timeline = Timeline::draw(&self.changes, &network, start_of, changes);
+        Fleet { scenario: self, seed, network, canyons, timeline, on_earth }
     }
 }
 
@@ -184,6 +193,7 @@ pub struct Fleet {
     seed: Seed,
     network: RoadNetwork,
     canyons: Vec<Canyon>,
+    timeline: Timeline,
     on_earth: Georeference,
 }
 
@@ -221,7 +231,7 @@ impl Fleet {
     /// Time of the first frame of drive `number`.
     #[must_use]
     pub fn start_of(&self, number: u32) -> TimestampNs {
-        TimestampNs(FIRST_START_NS + i64::from(number) * self.scenario.interval_ns)
+        start_of(self.scenario.interval_ns, number)
     }
 
     /// The drives in the order of time, each made when it is asked for.
@@ -237,14 +247,19 @@ impl Fleet {
 
     /// Every line that is truly there at a time.
     #[must_use]
-    pub fn truth_at(&self, _time: TimestampNs) -> FleetTruth {
-        let lines = self.network.lines().iter().map(|line| FleetTrueLine {
-            line: line.id,
-            category: line.category,
-            points: line.points.clone(),
-        });
-        FleetTruth { lines: lines.collect() }
+    pub fn truth_at(&self, time: TimestampNs) -> FleetTruth {
+        self.timeline.epoch(&self.network, time).truth(&self.network)
     }
+
+    /// The changes of the road in the order of time.
+    #[must_use]
+    pub fn changes(&self) -> &[RoadChange] {
+        self.timeline.changes()
+    }
+}
+
+fn start_of(interval_ns: i64, drive: u32) -> TimestampNs {
+    TimestampNs(FIRST_START_NS + i64::from(drive) * interval_ns)
 }
 
 #[cfg(test)]

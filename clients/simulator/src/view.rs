@@ -70,7 +70,7 @@ pub fn lines_in_view(
 /// The lines of the leg `leg` of a route and of the next ones, each once, and whether they are faced in their direction.
 pub(crate) fn line_ids_ahead(network: &RoadNetwork, legs: &[Leg], leg: usize) -> Vec<(RoadLineId, bool)> {
     let mut lines: Vec<(RoadLineId, bool)> = Vec::new();
-    for leg in legs.iter().skip(leg).take(LEGS_IN_SIGHT) {
+    for leg in legs_in_sight(legs, leg) {
         for id in &network.link(leg.link).lines {
             if !lines.contains(&(*id, leg.forward)) {
                 lines.push((*id, leg.forward));
@@ -78,6 +78,15 @@ pub(crate) fn line_ids_ahead(network: &RoadNetwork, legs: &[Leg], leg: usize) ->
         }
     }
     lines
+}
+
+/// The leg `leg` of a route and the next ones that may be in sight from it; a link driven again and again once.
+pub(crate) fn legs_in_sight(legs: &[Leg], leg: usize) -> impl Iterator<Item = &Leg> {
+    let ahead = &legs[leg.min(legs.len())..legs.len().min(leg + LEGS_IN_SIGHT)];
+    let is_new = |(index, leg): &(usize, &Leg)| {
+        ahead[..*index].iter().all(|before| (before.link, before.forward) != (leg.link, leg.forward))
+    };
+    ahead.iter().enumerate().filter(is_new).map(|(_, leg)| leg)
 }
 
 /// Those of `lines` that are in sight from a pose, from left to right; each with whether it is faced in its direction.

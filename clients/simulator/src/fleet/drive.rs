@@ -8,6 +8,7 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
 use super::{
     Fleet,
+    changes::Epoch,
     poison::Poison,
     traffic::{OtherVehicle, Traffic},
 };
@@ -15,7 +16,8 @@ use crate::{
     detector::Detector,
     drive::{Path, Route, TrueState, motion::FRAME_RATE_HZ},
     random::Purpose,
-    view::{LineView, line_ids_ahead, views_of},
+    road::RoadLine,
+    view::{LineView, legs_in_sight, line_ids_ahead, views_of},
 };
 
 /// One drive of a fleet. It holds its poses; its frames are made as they are asked for, the same each time.
@@ -25,6 +27,7 @@ pub struct FleetDrive<'a> {
     number: u32,
     route: Route,
     path: Path,
+    epoch: Epoch,
     traffic: Traffic,
     poison: Option<Poison>,
     world_from_odometry: Pose,
@@ -78,7 +81,8 @@ impl<'a> FleetDrive<'a> {
         let more_scale = poison.map_or(0.0, |poison| poison.odometry_scale());
         let odometry = scenario.odometry.apply(&exact, more_scale, &mut seed.stream(Purpose::Odometry, number));
         let traffic = Traffic::draw(&scenario.traffic, &states, &mut seed.stream(Purpose::Traffic, number));
-        Self { fleet, number, route, path, traffic, poison, world_from_odometry, states, fixes, odometry }
+        let epoch = fleet.timeline.epoch(network, start);
+        Self { fleet, number, route, path, epoch, traffic, poison, world_from_odometry, states, fixes, odometry }
     }
 
     /// Number within the fleet, from 0; also the order in time.
@@ -151,9 +155,7 @@ impl Iterator for FleetFrames<'_> {
         let truth = *drive.states.get(index)?;
         self.next += 1;
         let fleet = drive.fleet;
-        let ids = line_ids_ahead(&fleet.network, &drive.route.legs, truth.leg);
-        let lines = ids.into_iter().map(|(id, forward)| (fleet.network.line(id), forward));
-        let views = views_of(lines, &truth.world_from_vehicle, &self.sensor);
+        let views = views_of(drive.lines_ahead(truth.leg), &truth.world_from_vehicle, &self.sensor);
         let vehicles = drive.traffic.around(&fleet.network, &drive.route, &drive.path, &drive.states, index);
         let shadow = |vehicle: &OtherVehicle| vehicle.shadow(&truth.world_from_vehicle, &self.sensor);
         let shadows: Vec<Occlusion> = vehicles.iter().filter_map(shadow).collect();
@@ -193,6 +195,17 @@ impl FleetFrames<'_> {
 }
 
 impl FleetDrive<'_> {
+    /// The lines of a leg and of those after it, as they are in this drive, and whether each is faced in its direction.
+    fn lines_ahead(&self, leg: usize) -> impl Iterator<Item = (&RoadLine, bool)> {
+        let network = &self.fleet.network;
+        let ids = line_ids_ahead(network, &self.route.legs, leg).into_iter();
+        let lines =
+            ids.flat_map(move |(id, forward)| self.epoch.line(network, id).iter().map(move |line| (line, forward)));
+        let legs = legs_in_sight(&self.route.legs, leg);
+        let temporary = legs.flat_map(|leg| self.epoch.temporary(leg.link).iter().map(move |line| (line, leg.forward)));
+        lines.chain(temporary)
+    }
+
     fn parts(&self, index: usize, detections: Vec<Detection>, occlusions: Vec<Occlusion>) -> FrameParts {
         let receiver = &self.fleet.scenario.receiver;
         let (horizontal_m, vertical_m) = (receiver.stated_horizontal_m(), receiver.stated_vertical_m());

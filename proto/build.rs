@@ -2,13 +2,14 @@
 
 use std::{env, error::Error, fs, path::PathBuf};
 
-const FILES: [&str; 6] = [
+const FILES: [&str; 7] = [
     "lanemap/v1/admin_service.proto",
     "lanemap/v1/geometry.proto",
     "lanemap/v1/observation.proto",
     "lanemap/v1/lane_map.proto",
     "lanemap/v1/ingest_service.proto",
     "lanemap/v1/map_service.proto",
+    "lanemap/v1/shared_map.proto",
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -12,6 +12,7 @@
 
 pub mod alignment;
 pub mod base;
+pub mod cell;
 pub mod contribution;
 pub mod correction;
 pub mod fusion;
@@ -27,6 +28,7 @@ mod sparse;
 pub mod trace;
 
 pub use base::Base;
+pub use cell::CellId;
 pub use contribution::{Contribution, DriveId, TrajectoryPoint};
 pub use correction::Correction;
 pub use fusion::{FusedDrive, FusedMap, by_seniority, fold, fuse, fuse_onto, split_to_fold};

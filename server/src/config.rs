@@ -114,6 +114,19 @@ pub struct ServerConfig {
     pub unload_after_s: u64,
     /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for.
     pub max_cached_map_bytes: usize,
+    /// Threads that fuse the shared map, 0 to 64; 0: it stands still.
+    pub fuse_threads: usize,
+    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once.
+    pub fuse_interval_ms: u64,
+    /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work.
+    pub fuse_cpu_share: f64,
+    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped.
+    pub max_contributions_per_cell: usize,
+    /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;
+    /// of one cell at most 128.
+    pub cell_versions_kept_s: u64,
+    /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for.
+    pub max_cached_cell_bytes: usize,
     /// Time between pings that find dead connections, seconds, at least 1.
     pub keep_alive_s: u64,
     /// Longest that a stream may be open before it names its drive, seconds.
@@ -186,6 +199,12 @@ impl Default for ServerConfig {
             publish_interval_ms: 150,
             unload_after_s: 60,
             max_cached_map_bytes: 128 * 1024 * 1024,
+            fuse_threads: 1,
+            fuse_interval_ms: 500,
+            fuse_cpu_share: 0.5,
+            max_contributions_per_cell: 64,
+            cell_versions_kept_s: 3600,
+            max_cached_cell_bytes: 128 * 1024 * 1024,
             keep_alive_s: 20,
             start_wait_s: 10,
             drain_delay_ms: 0,
@@ -293,6 +312,12 @@ impl ServerConfig {
         within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("max_cached_map_bytes", self.max_cached_map_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
+        within("fuse_threads", self.fuse_threads as f64, 0.0, 64.0, "0 ..= 64")?;
+        within("fuse_interval_ms", self.fuse_interval_ms as f64, 0.0, 3_600_000.0, "0 ..= 3600000")?;
+        within("fuse_cpu_share", self.fuse_cpu_share, 0.01, 1.0, "0.01 ..= 1")?;
+        within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
+        within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;
+        within("max_cached_cell_bytes", self.max_cached_cell_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("start_wait_s", self.start_wait_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;

@@ -7,6 +7,7 @@
 //! A disk that runs full makes the journal refuse ([`JournalHealth`]) while the embedded store still has the room that it
 //! needs; what was acked stays, and writes are taken again once there is room.
 
+pub(crate) mod cells;
 mod committer;
 mod erasure;
 mod health;

@@ -1,8 +1,9 @@
-//! The lanemap service: ingest, sessions, journal, HTTP.
+//! The lanemap service: ingest, sessions, journal, the shared map, HTTP.
 //!
 //! A frame's way: [`ingest`] decodes and validates it, a session's actor ([`session`]) puts it into the [`journal`], acks
 //! it once it is durable, and only then hands it to the mapper. What the mapper knows is published as whole versions of
-//! a map ([`session::Sessions`]), which [`serve`] and the gRPC map service read.
+//! a map ([`session::Sessions`]); what all drives say together is fused into one map in the background ([`fuse`]). [`serve`]
+//! and the gRPC map service read both.
 //!
 //! A library without a `main`: the `lanemap` command and the tests start it with [`Server::start`].
 
@@ -10,6 +11,7 @@ pub mod admin;
 pub mod auth;
 pub mod config;
 pub mod error;
+pub mod fuse;
 #[doc(hidden)]
 pub mod fuzzing;
 pub mod ingest;

@@ -1,6 +1,9 @@
 //! Reading maps over gRPC, and the lane map's wire form, which HTTP serves too.
 
-use lanemap_core::Sequence;
+use lanemap_core::{
+    Sequence,
+    fleet::cell::{CellId, CellIdError},
+};
 use lanemap_proto::{
     encode,
     v1::{self, map_service_server::MapService},
@@ -10,6 +13,7 @@ use tonic::{Request, Response, Status};
 use crate::{
     auth::peer_of,
     error::Error,
+    fuse::{ChangesError, SharedMap},
     session::{PublishedMap, SessionId, SessionState, SessionSummary, Sessions},
 };
 
@@ -22,13 +26,14 @@ const MAX_PAGE: usize = 1000;
 #[derive(Clone, Debug)]
 pub struct MapGrpc {
     sessions: Sessions,
+    map: SharedMap,
 }
 
 impl MapGrpc {
     /// A service over the published maps.
     #[must_use]
-    pub fn new(sessions: Sessions) -> Self {
-        Self { sessions }
+    pub fn new(sessions: Sessions, map: SharedMap) -> Self {
+        Self { sessions, map }
     }
 }
 
@@ -58,6 +63,24 @@ fn session(published: &SessionSummary) -> v1::Session {
         last_sequence_inclusive: published.last_sequence.map(|Sequence(number)| number),
         last_time_unix_ns: published.last_time.0,
         preset: encode::preset(published.preset).into(),
+    }
+}
+
+fn cell(name: &str) -> Result<CellId, Status> {
+    name.parse().map_err(|error: CellIdError| Status::invalid_argument(error.to_string()))
+}
+
+/// Reads the shared map beside the runtime.
+async fn read<T: Send + 'static>(work: impl FnOnce() -> Result<T, ChangesError> + Send + 'static) -> Result<T, Status> {
+    let outcome = tokio::task::spawn_blocking(work).await;
+    outcome.map_err(|error| Status::internal(format!("the map cannot be read: {error}")))?.map_err(refused)
+}
+
+fn refused(error: ChangesError) -> Status {
+    match error {
+        ChangesError::NoSuchCell { .. } => Status::not_found(error.to_string()),
+        ChangesError::NotKept { .. } => Status::out_of_range(error.to_string()),
+        ChangesError::Store(error) => Error::from(error).into(),
     }
 }
 
@@ -100,5 +123,24 @@ impl MapService for MapGrpc {
         let published = found.ok_or(Error::NoSuchSession { session: name })?;
         let (session, map) = (session(&published), lane_map(&published));
         Ok(Response::new(v1::GetLaneMapResponse { session: Some(session), map: Some(map) }))
+    }
+
+    async fn get_cell(&self, request: Request<v1::GetCellRequest>) -> Result<Response<v1::GetCellResponse>, Status> {
+        peer_of(request.extensions())?.may_read(None)?;
+        let (cell, shared) = (cell(&request.into_inner().cell)?, self.map.clone());
+        let found = read(move || Ok(shared.get(cell)?)).await?;
+        let found = found.ok_or(ChangesError::NoSuchCell { cell }).map_err(refused)?;
+        Ok(Response::new(v1::GetCellResponse { map: Some(found.map.clone()) }))
+    }
+
+    async fn get_changes(
+        &self,
+        request: Request<v1::GetChangesRequest>,
+    ) -> Result<Response<v1::GetChangesResponse>, Status> {
+        peer_of(request.extensions())?.may_read(None)?;
+        let v1::GetChangesRequest { cell: name, since_version } = request.into_inner();
+        let (cell, shared) = (cell(&name)?, self.map.clone());
+        let changes = read(move || shared.changes_since(cell, since_version)).await?;
+        Ok(Response::new(v1::GetChangesResponse { changes: Some(changes) }))
     }
 }

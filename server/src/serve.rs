@@ -5,13 +5,22 @@
 //! | `/sessions` | the drives, newest first: state, version, where they are; `limit` |
 //! | `/sessions/{id}/lanes.geojson` | the lanes of one drive in WGS84; `?crs=local`: in metres |
 //! | `/sessions/{id}/lanes.pb` | the same lanes as splines, protobuf `lanemap.v1.LaneMap` |
-//! | `/collections/lanes/items` | the lanes of all georeferenced drives; `bbox`, `limit` |
+//! | `/collections/lanes/items` | the lines of the shared map; `bbox`, `limit` |
+//! | `/collections/drives/items` | the lanes of all georeferenced drives, each as it alone saw them; `bbox`, `limit` |
+//! | `/cells` | the cells of the shared map: version, quality, whether they are up to date; `limit` |
+//! | `/cells/{id}` | one of them |
+//! | `/cells/{id}/lanes.geojson` | its lines in WGS84 |
+//! | `/cells/{id}/lanes.pb` | the same as splines, protobuf `lanemap.v1.CellMap` |
+//! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
+//! | `/splines/{z}/{x}/{y}` | the lines that touch a tile, as splines, protobuf `lanemap.v1.SplineTile` |
 //! | `/viewer` | a page that draws them |
 //! | `/healthz`, `/readyz`, `/metrics` | for operators |
 //!
 //! Answers carry strong entity tags; refusals are RFC 9457 problem documents.
 
 pub mod bounds;
+mod cells;
+mod drive_items;
 pub mod entity_tag;
 pub mod extents;
 pub mod features;
@@ -23,6 +32,8 @@ mod query;
 #[cfg(test)]
 pub(crate) mod sample;
 mod sessions;
+mod shared_lanes;
+mod splines;
 mod viewer;
 
 use axum::{
@@ -45,13 +56,15 @@ use self::{
     extents::Extents,
     problem::{Problem, repeated},
 };
-use crate::{auth::layer::require_read, session::Sessions};
+use crate::{auth::layer::require_read, fuse::SharedMap, session::Sessions};
 
 /// What the HTTP handlers read.
 #[derive(Clone)]
 pub struct ServeState {
     /// The published maps.
     pub sessions: Sessions,
+    /// The shared map.
+    pub map: SharedMap,
     /// Renders `/metrics`.
     pub metrics: PrometheusHandle,
     /// Whether the service takes traffic; falls first when it shuts down.
@@ -98,6 +111,14 @@ pub fn router(state: ServeState) -> Router {
         .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
         .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
         .route(items::PATH, get(items::items))
+        .route(drive_items::PATH, get(drive_items::items))
+        .route("/cells", get(cells::list))
+        .route("/cells/{id}", get(cells::one))
+        .route("/cells/{id}/lanes.geojson", get(cells::lanes_geojson))
+        .route("/cells/{id}/lanes.pb", get(cells::lanes_protobuf))
+        .route("/cells/{id}/changes", get(cells::changes_json))
+        .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
+        .route("/splines/{z}/{x}/{y}", get(splines::tile))
         .route("/metrics", get(operation::metrics))
         .route_layer(middleware::from_fn(require_read));
     Router::new()

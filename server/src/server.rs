@@ -25,6 +25,7 @@ use crate::{
         reload::{CredentialError, Credentials},
     },
     config::{ConfigError, ServerConfig, ZenohMode},
+    fuse::{FuseSettings, FuseThreads, Fuser, SharedMap},
     ingest::{BoundedIngest, IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
     journal::{CommitterThread, Journal, JournalError, JournalHealth, JournalOptions},
     listener,
@@ -89,6 +90,7 @@ pub struct Server;
 pub struct RunningServer {
     address: SocketAddr,
     sessions: Sessions,
+    map: SharedMap,
     credentials: Credentials,
     stop: CancellationToken,
     task: JoinHandle<()>,
@@ -110,11 +112,14 @@ impl Server {
         let pseudonyms = pseudonyms(&config, &journal)?;
         let (sessions, stop, shutdown) =
             (Sessions::new(config.max_cached_map_bytes), CancellationToken::new(), CancellationToken::new());
+        let map = SharedMap::new(config.max_cached_cell_bytes);
+        let fuse_threads = start_fusing(&config, &journal, map.clone()).await.map_err(in_store)?;
         let surroundings = Surroundings {
             config: Arc::clone(&config),
             journal: journal.clone(),
             pseudonyms,
             sessions: sessions.clone(),
+            fuser: fuse_threads.fuser(),
             in_flight: InFlightBudget::new(&config),
             shutdown: shutdown.clone(),
         };
@@ -125,7 +130,13 @@ impl Server {
         let address = listener.local_addr().map_err(listen_error)?;
 
         let (ready, is_ready) = watch::channel(Readiness::Ready);
-        let http = ServeState { sessions: sessions.clone(), metrics, ready: is_ready, shutdown: shutdown.clone() };
+        let http = ServeState {
+            sessions: sessions.clone(),
+            map: map.clone(),
+            metrics,
+            ready: is_ready,
+            shutdown: shutdown.clone(),
+        };
         let streams = TaskTracker::new();
         let conversations =
             Conversations::new(Arc::clone(&config), registry.clone(), shutdown.clone(), streams.clone());
@@ -153,6 +164,8 @@ impl Server {
             config,
             credentials: credentials.clone(),
             registry,
+            map: map.clone(),
+            fuse_threads,
             streams,
             zenoh,
             ready,
@@ -165,7 +178,7 @@ impl Server {
         metrics::gauge!(telemetry::READY).set(1.0);
         let task = tokio::spawn(running.run(listener, router));
         tracing::info!(%address, "serving gRPC and HTTP");
-        Ok(RunningServer { address, sessions, credentials, stop, task })
+        Ok(RunningServer { address, sessions, map, credentials, stop, task })
     }
 }
 
@@ -193,6 +206,12 @@ impl RunningServer {
     #[must_use]
     pub fn sessions(&self) -> &Sessions {
         &self.sessions
+    }
+
+    /// The shared map.
+    #[must_use]
+    pub fn map(&self) -> &SharedMap {
+        &self.map
     }
 
     /// Begins a shutdown when cancelled; e.g. from a signal handler.
@@ -227,6 +246,8 @@ struct Running {
     config: Arc<ServerConfig>,
     credentials: Credentials,
     registry: SessionRegistry,
+    map: SharedMap,
+    fuse_threads: FuseThreads,
     streams: TaskTracker,
     zenoh: Option<ZenohIngest>,
     ready: watch::Sender<Readiness>,
@@ -321,6 +342,10 @@ impl Running {
         }
         upkeep.abort();
         watching.abort();
+        if timeout(grace, self.fuse_threads.stop()).await.is_err() {
+            tracing::warn!("a cell was still being fused at the end of the grace time");
+        }
+        self.map.let_go_of_store();
         self.registry.let_go_of_store();
         drop(self.registry);
         drop(self.journal);
@@ -328,6 +353,13 @@ impl Running {
             tracing::warn!("the journal was still in use at the end of the grace time");
         }
     }
+}
+
+/// Starts the threads that fuse the shared map, which is read from the store.
+async fn start_fusing(config: &ServerConfig, journal: &Journal, map: SharedMap) -> Result<FuseThreads, JournalError> {
+    let (settings, store) = (FuseSettings::of(config), journal.cells());
+    let starting = tokio::task::spawn_blocking(move || Fuser::start(settings, &store, map));
+    starting.await.map_err(|error| JournalError::Store(format!("reading the shared map: {error}")))?
 }
 
 /// The pseudonyms of the store's drives.
@@ -380,7 +412,8 @@ async fn router(
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()?;
-    let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone())).send_compressed(CompressionEncoding::Gzip);
+    let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone(), http.map.clone()))
+        .send_compressed(CompressionEncoding::Gzip);
     let ingest = BoundedIngest::new(ingest, config.max_message_bytes);
     let routes = Routes::from(serve::router(http))
         .add_service(ingest)

@@ -39,6 +39,19 @@ pub const CREDENTIALS_REFUSED: &str = "lanemap_credentials_refused_total";
 /// Poses and local maps dropped because their client did not read them.
 pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 
+/// Cells of the shared map.
+pub const CELLS: &str = "lanemap_cells";
+/// Cells of which drives have said something that is not in the map yet.
+pub const CELLS_DIRTY: &str = "lanemap_cells_dirty";
+/// Cells that were fused.
+pub const CELLS_FUSED: &str = "lanemap_cells_fused_total";
+/// Seconds of fusing one cell.
+pub const FUSE_SECONDS: &str = "lanemap_fuse_seconds";
+/// Contributions of drives to cells that came or changed.
+pub const CONTRIBUTIONS: &str = "lanemap_contributions_total";
+/// Seconds of cutting one drive into contributions and storing those that changed.
+pub const CONTRIBUTE_SECONDS: &str = "lanemap_contribute_seconds";
+
 /// Streams over zenoh that ended because a message was missing, too large or too many, by gRPC `code`.
 pub const ZENOH_BROKEN: &str = "lanemap_zenoh_streams_broken_total";
 /// Messages over zenoh that came again and were passed over.
@@ -97,13 +110,13 @@ fn begin_at_zero() {
     for name in [FRAMES_ACKED, FRAMES_REPEATED, UPDATES_DROPPED, HANDSHAKES_FAILED, CREDENTIALS_REFUSED] {
         metrics::counter!(name).increment(0);
     }
-    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY] {
+    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY, CELLS_FUSED, CONTRIBUTIONS] {
         metrics::counter!(name).increment(0);
     }
     for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
         metrics::counter!(REFUSALS, "reason" => reason.as_str_name()).increment(0);
     }
-    for name in [SESSIONS_LIVE, CONNECTIONS] {
+    for name in [SESSIONS_LIVE, CONNECTIONS, CELLS, CELLS_DIRTY] {
         metrics::gauge!(name).increment(0.0);
     }
 }
@@ -129,5 +142,11 @@ fn describe() {
     describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "From a request to the head of its answer");
     describe_gauge!(READY, Unit::Count, "1 while the service takes traffic, 0 from the moment it begins to stop");
     describe_gauge!(BUILD_INFO, Unit::Count, "Always 1, with the version of the service");
+    describe_gauge!(CELLS, Unit::Count, "Cells of the shared map");
+    describe_gauge!(CELLS_DIRTY, Unit::Count, "Cells that are not fused from what drives say now");
+    describe_counter!(CELLS_FUSED, Unit::Count, "Cells that were fused");
+    describe_histogram!(FUSE_SECONDS, Unit::Seconds, "Fusing one cell");
+    describe_counter!(CONTRIBUTIONS, Unit::Count, "Contributions of drives to cells that came or changed");
+    describe_histogram!(CONTRIBUTE_SECONDS, Unit::Seconds, "Cutting one drive into contributions and storing them");
     describe_counter!(UPDATES_DROPPED, Unit::Count, "Poses and local maps that their client did not read in time");
 }

@@ -86,7 +86,8 @@ pub struct ServeArgs {
     #[arg(long, value_name = "FILE")]
     zenoh_vehicles_file: Option<PathBuf>,
     /// Vehicles that may connect to the router with a password: fleet/vehicle:password on each line; each may use its
-    /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default: none]
+    /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default:
+    /// none]
     #[arg(long, value_name = "FILE")]
     zenoh_passwords_file: Option<PathBuf>,
     /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts
@@ -99,7 +100,8 @@ pub struct ServeArgs {
     /// File of the password of --zenoh-user [env: LANEMAP_ZENOH_PASSWORD_FILE] [default: none]
     #[arg(long, value_name = "FILE")]
     zenoh_password_file: Option<PathBuf>,
-    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as lanemap zenoh-access has it
+    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as lanemap zenoh-access has
+    /// it
     /// [env: LANEMAP_ZENOH_TRUST_ROUTER] [default: false]
     #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     zenoh_trust_router: Option<bool>,
@@ -156,7 +158,8 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_WAITING_COMMITS] [default: 4096]
     #[arg(long, value_name = "N")]
     max_waiting_commits: Option<usize>,
-    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go on
+    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go
+    /// on
     /// [env: LANEMAP_MIN_FREE_DISK_BYTES] [default: 536870912]
     #[arg(long, value_name = "BYTES")]
     min_free_disk_bytes: Option<u64>,
@@ -176,6 +179,30 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_CACHED_MAP_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
     max_cached_map_bytes: Option<usize>,
+    /// Threads that fuse the shared map, 0 to 64; 0: it stands still [env: LANEMAP_FUSE_THREADS] [default: 1]
+    #[arg(long, value_name = "N")]
+    fuse_threads: Option<usize>,
+    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once [env:
+    /// LANEMAP_FUSE_INTERVAL_MS] [default: 500]
+    #[arg(long, value_name = "MS")]
+    fuse_interval_ms: Option<u64>,
+    /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work [env:
+    /// LANEMAP_FUSE_CPU_SHARE] [default: 0.5]
+    #[arg(long, value_name = "SHARE")]
+    fuse_cpu_share: Option<f64>,
+    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped [env:
+    /// LANEMAP_MAX_CONTRIBUTIONS_PER_CELL] [default: 64]
+    #[arg(long, value_name = "N")]
+    max_contributions_per_cell: Option<usize>,
+    /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;
+    /// of one cell at most 128
+    /// [env: LANEMAP_CELL_VERSIONS_KEPT_S] [default: 3600]
+    #[arg(long, value_name = "S")]
+    cell_versions_kept_s: Option<u64>,
+    /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for [env:
+    /// LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
+    #[arg(long, value_name = "BYTES")]
+    max_cached_cell_bytes: Option<usize>,
     /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]
     #[arg(long, value_name = "S")]
     keep_alive_s: Option<u64>,
@@ -258,6 +285,12 @@ impl ServeArgs {
             publish_interval_ms: self.publish_interval_ms,
             unload_after_s: self.unload_after_s,
             max_cached_map_bytes: self.max_cached_map_bytes,
+            fuse_threads: self.fuse_threads,
+            fuse_interval_ms: self.fuse_interval_ms,
+            fuse_cpu_share: self.fuse_cpu_share,
+            max_contributions_per_cell: self.max_contributions_per_cell,
+            cell_versions_kept_s: self.cell_versions_kept_s,
+            max_cached_cell_bytes: self.max_cached_cell_bytes,
             keep_alive_s: self.keep_alive_s,
             start_wait_s: self.start_wait_s,
             drain_delay_ms: self.drain_delay_ms,

@@ -93,6 +93,18 @@ pub struct ConfigOverrides {
     pub unload_after_s: Option<u64>,
     /// See [`ServerConfig::max_cached_map_bytes`].
     pub max_cached_map_bytes: Option<usize>,
+    /// See [`ServerConfig::fuse_threads`].
+    pub fuse_threads: Option<usize>,
+    /// See [`ServerConfig::fuse_interval_ms`].
+    pub fuse_interval_ms: Option<u64>,
+    /// See [`ServerConfig::fuse_cpu_share`].
+    pub fuse_cpu_share: Option<f64>,
+    /// See [`ServerConfig::max_contributions_per_cell`].
+    pub max_contributions_per_cell: Option<usize>,
+    /// See [`ServerConfig::cell_versions_kept_s`].
+    pub cell_versions_kept_s: Option<u64>,
+    /// See [`ServerConfig::max_cached_cell_bytes`].
+    pub max_cached_cell_bytes: Option<usize>,
     /// See [`ServerConfig::keep_alive_s`].
     pub keep_alive_s: Option<u64>,
     /// See [`ServerConfig::start_wait_s`].
@@ -158,6 +170,12 @@ impl ConfigOverrides {
         set(&mut settings.publish_interval_ms, self.publish_interval_ms);
         set(&mut settings.unload_after_s, self.unload_after_s);
         set(&mut settings.max_cached_map_bytes, self.max_cached_map_bytes);
+        set(&mut settings.fuse_threads, self.fuse_threads);
+        set(&mut settings.fuse_interval_ms, self.fuse_interval_ms);
+        set(&mut settings.fuse_cpu_share, self.fuse_cpu_share);
+        set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
+        set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
+        set(&mut settings.max_cached_cell_bytes, self.max_cached_cell_bytes);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
         set(&mut settings.start_wait_s, self.start_wait_s);
         set(&mut settings.drain_delay_ms, self.drain_delay_ms);

@@ -178,8 +178,10 @@ impl Store {
         Ok(())
     }
 
-    fn keyspaces(&self) -> [&Keyspace; 7] {
+    fn keyspaces(&self) -> impl Iterator<Item = &Keyspace> {
         [&self.records, &self.frames, &self.snapshots, &self.summaries, &self.cuts, &self.facts, &self.forgotten]
+            .into_iter()
+            .chain(self.map_keyspaces())
     }
 }
 

@@ -12,6 +12,8 @@
 //! | `forgotten` | pseudonym of a drive that was deleted        | day of it                   |
 //! | `filler`    |                                              | see [`super::erasure`]      |
 //!
+//! Beside them stand those of the shared map: see [`super::cells`].
+//!
 //! No name of a fleet, a vehicle or a drive stands in any of them.
 
 use std::{
@@ -55,6 +57,13 @@ pub(super) struct Store {
     pub(super) facts: Keyspace,
     pub(super) forgotten: Keyspace,
     pub(super) filler: Keyspace,
+    pub(super) contributions: Keyspace,
+    pub(super) contribution_facts: Keyspace,
+    pub(super) contributed: Keyspace,
+    pub(super) cells: Keyspace,
+    pub(super) cell_lines: Keyspace,
+    pub(super) cell_versions: Keyspace,
+    pub(super) cell_purges: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
@@ -84,6 +93,13 @@ impl Store {
             facts: keyspace("facts", MAX_SMALL_MEMTABLE_BYTES)?,
             forgotten: keyspace("forgotten", MAX_SMALL_MEMTABLE_BYTES)?,
             filler: keyspace("filler", MAX_MEMTABLE_BYTES)?,
+            contributions: keyspace("contributions", MAX_MEMTABLE_BYTES)?,
+            contribution_facts: keyspace("contribution_facts", MAX_SMALL_MEMTABLE_BYTES)?,
+            contributed: keyspace("contributed", MAX_SMALL_MEMTABLE_BYTES)?,
+            cells: keyspace("cells", MAX_SMALL_MEMTABLE_BYTES)?,
+            cell_lines: keyspace("cell_lines", MAX_MEMTABLE_BYTES)?,
+            cell_versions: keyspace("cell_versions", MAX_MEMTABLE_BYTES)?,
+            cell_purges: keyspace("cell_purges", MAX_SMALL_MEMTABLE_BYTES)?,
             folder: folder.to_owned(),
             database,
         })
@@ -193,7 +209,7 @@ impl StoreBatch<'_> {
         self.batch.remove(&self.store.cuts, session.to_key());
         self.batch.remove(&self.store.summaries, session.to_key());
         self.batch.remove(&self.store.records, session.to_key());
-        Ok(())
+        self.remove_contributions(session)
     }
 
     /// Makes everything in the batch durable.

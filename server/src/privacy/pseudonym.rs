@@ -2,6 +2,7 @@
 
 use std::{fmt, path::Path, sync::Arc};
 
+use lanemap_core::fleet::DriveId;
 use serde::{Deserialize, Serialize};
 
 use super::key::{KeyError, PrivacyKey};
@@ -69,14 +70,23 @@ impl Pseudonyms {
         DrivePseudonym(self.key.digest(&[b"drive", fleet, vehicle, drive]))
     }
 
+    /// The name of a drive in the shared map, which is published: it tells neither the drive's pseudonym nor its session.
+    #[must_use]
+    pub fn in_shared_map(&self, drive: DrivePseudonym) -> DriveId {
+        DriveId(first_of(self.key.digest(&[b"shared map", &drive.0])))
+    }
+
     /// A number that nobody can foretell without the key: `moment_ns` makes it another one every time.
     #[must_use]
     pub fn noise(&self, drive: DrivePseudonym, moment_ns: u128) -> u64 {
-        let digest = self.key.digest(&[b"noise", &drive.0, &moment_ns.to_le_bytes()]);
-        let mut first = [0; 8];
-        first.copy_from_slice(&digest[..8]);
-        u64::from_le_bytes(first)
+        first_of(self.key.digest(&[b"noise", &drive.0, &moment_ns.to_le_bytes()]))
     }
+}
+
+fn first_of(digest: [u8; 32]) -> u64 {
+    let mut first = [0; 8];
+    first.copy_from_slice(&digest[..8]);
+    u64::from_le_bytes(first)
 }
 
 impl fmt::Debug for VehiclePseudonym {

@@ -176,7 +176,7 @@ pub fn feature(published: &PublishedMap, lane: &MapLane, crs: Crs) -> Option<Lan
     Some(LaneFeature { id: feature_id(published.session, lane), geometry, properties: properties(published, lane) })
 }
 
-fn on_the_earth(line: Vec<Coordinate>) -> LaneGeometry {
+pub(super) fn on_the_earth(line: Vec<Coordinate>) -> LaneGeometry {
     let mut parts = line::cut_at_antimeridian(line);
     match (parts.len(), parts.pop()) {
         (1, Some(coordinates)) => LaneGeometry::LineString { coordinates },

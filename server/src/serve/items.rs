@@ -1,7 +1,7 @@
-//! `/collections/lanes/items`: the lanes of all georeferenced sessions, a bounded page at a time.
+//! `/collections/lanes/items`: the lines of the shared map, a bounded page at a time.
 //!
-//! Pages are cut after a lane, not at an offset, so that a map that grows between two pages neither repeats nor hides a
-//! lane that was there all along: `after` names the last lane of the page before, which is not repeated.
+//! Pages are cut after a line, not at an offset, so that a map that changes between two pages neither repeats nor hides a
+//! line that was there all along: `after` names the last line of the page before, which is not repeated.
 
 use std::sync::Arc;
 
@@ -10,36 +10,35 @@ use axum::{
     http::{HeaderMap, Uri, header},
     response::Response,
 };
-use lanemap_core::MapLane;
+use lanemap_core::fleet::CellId;
+use lanemap_proto::v1;
 use serde::Serialize;
 
 use super::{
     ServeState,
     bounds::Bounds,
+    drive_items::{DEFAULT_LIMIT, MOST_COORDINATES, MOST_LANES, links},
     entity_tag::EntityTag,
-    extents::Extents,
-    features::{Crs, LaneFeature, feature},
     in_background,
     problem::Problem,
     query::{Parameters, parse_limit},
-    sessions::{GEOJSON, Link, identity},
+    sessions::{GEOJSON, Link},
+    shared_lanes::{SharedLane, shared_lane},
 };
-use crate::session::{PublishedMap, SessionId, SessionSummary, Sessions};
+use crate::{
+    fuse::{CellRecord, SharedMap, wire::parse_lane_id},
+    journal::JournalError,
+};
 
 /// Path of the collection's items.
 pub(super) const PATH: &str = "/collections/lanes/items";
-/// Lanes of a page, where the query does not say.
-const DEFAULT_LIMIT: usize = 1_000;
-/// Most lanes of a page.
-const MOST_LANES: usize = 10_000;
-/// Most coordinates of a page; the lane that reaches it is the page's last.
-const MOST_COORDINATES: usize = 200_000;
 
-/// The last lane of a page.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+/// The last line of a page.
+#[derive(Clone, Debug, PartialEq, Eq)]
 struct Cursor {
-    session: SessionId,
-    lane: u64,
+    cell: CellId,
+    lane: String,
+    part: u32,
 }
 
 /// What a page is asked for.
@@ -57,14 +56,22 @@ struct Page {
     #[serde(rename = "numberReturned")]
     number_returned: usize,
     links: Vec<Link>,
-    features: Vec<LaneFeature>,
+    features: Vec<SharedLane>,
 }
 
 impl Cursor {
     fn parse(text: &str) -> Result<Self, String> {
-        let read =
-            |(session, lane): (&str, &str)| Some(Self { session: session.parse().ok()?, lane: lane.parse().ok()? });
-        text.split_once('.').and_then(read).ok_or_else(|| "it must be the id of a feature".to_owned())
+        let mut parts = text.split('.');
+        let mut read = || {
+            let (cell, lane, part) = (parts.next()?, parts.next()?, parts.next()?);
+            parse_lane_id(lane)?;
+            Some(Self { cell: cell.parse().ok()?, lane: lane.to_owned(), part: part.parse().ok()? })
+        };
+        read().filter(|_| parts.next().is_none()).ok_or_else(|| "it must be the id of a feature".to_owned())
+    }
+
+    fn is_before(&self, cell: CellId, lane: &v1::FusedLane) -> bool {
+        (self.cell, self.lane.as_str(), self.part) < (cell, lane.id.as_str(), lane.part)
     }
 }
 
@@ -77,175 +84,82 @@ impl PageQuery {
             after_exclusive: parameters.get("after", Cursor::parse)?,
         })
     }
+
+    /// Whether a cell may have lines of the page.
+    fn wants(&self, cell: CellId) -> bool {
+        self.after_exclusive.as_ref().is_none_or(|after| after.cell <= cell)
+            && self.bounds.is_none_or(|bounds| of_cell(cell).loosened().touches(&bounds))
+    }
+}
+
+/// The borders of a cell.
+pub(super) fn of_cell(cell: CellId) -> Bounds {
+    let bounds = cell.bounds();
+    Bounds { west: bounds.west, south: bounds.south, east: bounds.east, north: bounds.north, heights: None }
 }
 
 /// `GET /collections/lanes/items`
-pub(super) async fn items(
-    State(state): State<ServeState>,
-    State(extents): State<Extents>,
-    uri: Uri,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
+pub(super) async fn items(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
     let query = PageQuery::read(&uri)?;
-    let summaries = state.sessions.list();
+    let mut cells = state.map.list();
+    cells.retain(|(cell, record)| record.lanes > 0 && query.wants(*cell));
     let asked = uri.query().unwrap_or_default().to_owned();
-    let tag = EntityTag::of((summaries.iter().map(|summary| identity(summary)).collect::<Vec<_>>(), &asked));
+    let versions: Vec<_> = cells.iter().map(|(cell, record)| (*cell, record.version)).collect();
+    let tag = EntityTag::of((versions, &asked));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let candidates = Candidates { summaries, sessions: state.sessions, extents };
-    let body = in_background(move || serde_json::to_vec(&page(&candidates, &query, &asked))).await?;
-    let body = body.map_err(|_| Problem::Internal)?;
-    Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
-}
-
-/// Where the lanes of a page are found.
-struct Candidates {
-    summaries: Vec<Arc<SessionSummary>>,
-    sessions: Sessions,
-    extents: Extents,
+    let body = in_background(move || {
+        let page = page(&state.map, &cells, &query, &asked)?;
+        serde_json::to_vec(&page).map_err(|error| JournalError::Store(error.to_string()))
+    });
+    Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body.await??)))
 }
 
 /// The page that a query asks for; `asked` is the query as it was written.
-fn page(candidates: &Candidates, query: &PageQuery, asked: &str) -> Page {
+fn page(
+    map: &SharedMap,
+    cells: &[(CellId, Arc<CellRecord>)],
+    query: &PageQuery,
+    asked: &str,
+) -> Result<Page, JournalError> {
     let mut features = Vec::new();
     let mut coordinates = 0;
     let mut more = false;
-    'page: for map in candidates.maps(query) {
-        for lane in lanes(&map, query) {
-            let Some(found) = feature(&map, lane, Crs::Wgs84) else { continue };
-            if query.bounds.is_some_and(|bounds| !found.geometry.enters(&bounds)) {
+    'page: for (cell, _) in cells {
+        let Some(found) = map.get(*cell)? else { continue };
+        let anchor = cell.anchor();
+        let after = query.after_exclusive.as_ref();
+        for lane in found.map.lanes.iter().filter(|lane| after.is_none_or(|after| after.is_before(*cell, lane))) {
+            let Some(lane) = shared_lane(&anchor, &found.map, lane) else { continue };
+            if query.bounds.is_some_and(|bounds| !lane.geometry.enters(&bounds)) {
                 continue;
             }
             if features.len() == query.limit || coordinates >= MOST_COORDINATES {
                 more = true;
                 break 'page;
             }
-            coordinates += found.geometry.size();
-            features.push(found);
+            coordinates += lane.geometry.size();
+            features.push(lane);
         }
     }
-    Page { number_returned: features.len(), links: links(asked, features.last().filter(|_| more)), features }
-}
-
-impl Candidates {
-    /// The maps of georeferenced sessions from the cursor on that may enter the box, read one after the other.
-    fn maps(&self, query: &PageQuery) -> impl Iterator<Item = Arc<PublishedMap>> {
-        self.summaries
-            .iter()
-            .filter(|summary| summary.georeference.is_some())
-            .filter(|summary| query.after_exclusive.is_none_or(|after| summary.session >= after.session))
-            .filter(|summary| may_touch(query.bounds, || self.extents.of(summary)))
-            .filter_map(|summary| self.sessions.get(&summary.session))
-    }
-}
-
-/// The lanes of a map after the cursor that may enter the box.
-fn lanes<'a>(map: &'a PublishedMap, query: &'a PageQuery) -> impl Iterator<Item = &'a MapLane> {
-    map.map
-        .lanes
-        .iter()
-        .filter(|lane| {
-            query.after_exclusive.is_none_or(|after| Cursor { session: map.session, lane: lane.id.0 } > after)
-        })
-        .filter(|lane| may_touch(query.bounds, || around(map, lane)))
-}
-
-/// Whether what lies within the box `around` it may enter `bounds`; never wrong where it says no.
-fn may_touch(bounds: Option<Bounds>, around: impl FnOnce() -> Option<Bounds>) -> bool {
-    bounds.is_none_or(|bounds| around().is_some_and(|around| around.loosened().touches(&bounds)))
-}
-
-/// The box around a lane's control points.
-fn around(map: &PublishedMap, lane: &MapLane) -> Option<Bounds> {
-    let points = lane.control_points.iter().map(|point| point.position);
-    Bounds::around(map.georeference.as_ref()?, points)
-}
-
-fn links(asked: &str, last: Option<&LaneFeature>) -> Vec<Link> {
-    let link = |rel, query: &str| {
-        let mark = if query.is_empty() { "" } else { "?" };
-        Link { rel, media_type: GEOJSON, href: format!("{PATH}{mark}{query}") }
-    };
-    let next = last.map(|last| {
-        let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("after="));
-        let query: Vec<&str> = kept.collect();
-        let after = format!("after={}", last.id);
-        link("next", &query.into_iter().chain([after.as_str()]).collect::<Vec<_>>().join("&"))
-    });
-    std::iter::once(link("self", asked)).chain(next).collect()
+    let last = features.last().filter(|_| more).map(|last: &SharedLane| last.id.clone());
+    Ok(Page { number_returned: features.len(), links: links(PATH, asked, last.as_deref()), features })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serve::{
-        features::feature_id,
-        sample::{georeference, placed, published},
-    };
-
-    fn three_sessions() -> Vec<PublishedMap> {
-        [(1, Some(11.58)), (2, None), (3, Some(11.60))]
-            .into_iter()
-            .map(|(number, longitude)| {
-                let map = published(number, 3);
-                match longitude {
-                    Some(longitude) => placed(map, georeference(longitude, 48.14)),
-                    None => map,
-                }
-            })
-            .collect()
-    }
-
-    fn ask(query: &str) -> Page {
-        let uri = format!("{PATH}?{query}").parse().unwrap();
-        let sessions = Sessions::default();
-        for map in three_sessions() {
-            sessions.publish(map);
-        }
-        let candidates = Candidates { summaries: sessions.list(), sessions, extents: Extents::default() };
-        page(&candidates, &PageQuery::read(&uri).unwrap(), query)
-    }
-
-    #[test]
-    fn pages_of_two_give_every_lane_of_the_georeferenced_sessions_once() {
-        let mut query = "limit=2".to_owned();
-        let mut seen = Vec::new();
-        loop {
-            let page = ask(&query);
-            assert!(page.number_returned <= 2);
-            seen.extend(page.features.iter().map(|feature| feature.id.clone()));
-            let Some(next) = page.links.iter().find(|link| link.rel == "next") else { break };
-            query = next.href.split_once('?').unwrap().1.to_owned();
-        }
-        let maps = three_sessions();
-        let expected: Vec<_> = [0, 2]
-            .iter()
-            .flat_map(|&i| maps[i].map.lanes.iter().map(move |lane| (i, lane)))
-            .map(|(i, lane)| feature_id(maps[i].session, lane))
-            .collect();
-        assert_eq!(seen, expected);
-    }
-
-    #[test]
-    fn a_page_that_is_just_full_has_no_next() {
-        assert_eq!(ask("limit=6").links.len(), 1);
-        assert_eq!(ask("limit=5").links.len(), 2);
-    }
-
-    #[test]
-    fn a_box_around_one_session_gives_its_lanes_only() {
-        let page = ask("bbox=11.57,48.13,11.59,48.15");
-        assert_eq!(page.number_returned, 3);
-        assert!(page.features.iter().all(|feature| feature.properties.session == page.features[0].properties.session));
-        assert_eq!(ask("bbox=12,48,13,49").number_returned, 0);
-    }
 
     #[test]
     fn a_limit_or_cursor_out_of_range_is_refused() {
-        for (query, parameter) in
-            [("limit=0", "limit"), ("limit=10001", "limit"), ("limit=-1", "limit"), ("after=3", "after")]
-        {
+        for (query, parameter) in [
+            ("limit=0", "limit"),
+            ("limit=10001", "limit"),
+            ("limit=-1", "limit"),
+            ("after=3", "after"),
+            ("after=14-1-1.x.0", "after"),
+        ] {
             let uri = format!("{PATH}?{query}").parse().unwrap();
             let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri) else { panic!("{query}") };
             assert_eq!(name, parameter);

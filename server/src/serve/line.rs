@@ -19,7 +19,7 @@
 //! ```
 
 use lanemap_core::{
-    ControlPoint, MapLane,
+    ControlPoint, EndRule, MapLane,
     geometry::georeference::{Georeference, Wgs84},
     spline::{ControlPolygon, Curve},
 };
@@ -38,9 +38,18 @@ pub type Coordinate = [f64; 3];
 #[must_use]
 pub fn drawn(lane: &MapLane) -> Vec<Point3<f64>> {
     let points: &[ControlPoint] = &lane.control_points;
-    let Some(curve) = Curve::new(points, lane.ends) else { return Vec::new() };
-    let from = lane.drawn_from.max(curve.first_parameter());
-    let to = lane.drawn_to.min(curve.last_parameter());
+    Curve::new(points, lane.ends).map(|curve| chords(&curve, lane.drawn_from, lane.drawn_to)).unwrap_or_default()
+}
+
+/// Points of a spline that reaches its first and last control point; empty where there are fewer than two.
+#[must_use]
+pub fn drawn_through(points: &[Point3<f64>]) -> Vec<Point3<f64>> {
+    let curve = Curve::new(points, EndRule::Reflected);
+    curve.map(|curve| chords(&curve, curve.first_parameter(), curve.last_parameter())).unwrap_or_default()
+}
+
+fn chords<P: ControlPolygon + ?Sized>(curve: &Curve<'_, P>, from: f64, to: f64) -> Vec<Point3<f64>> {
+    let (from, to) = (from.max(curve.first_parameter()), to.min(curve.last_parameter()));
     if from >= to {
         return Vec::new();
     }
@@ -48,7 +57,7 @@ pub fn drawn(lane: &MapLane) -> Vec<Point3<f64>> {
     let mut start = from;
     while start < to {
         let end = (start.floor() + 1.0).min(to);
-        let chords = chords_of(&curve, start, end);
+        let chords = chords_of(curve, start, end);
         let mut chord = 1.0;
         while chord <= chords {
             line.push(curve.point(start + (end - start) * chord / chords));

@@ -10,6 +10,7 @@ use thiserror::Error;
 use crate::{
     auth::{Action, AuthenticationError},
     error::Error as ServiceError,
+    journal::JournalError,
     session::SessionId,
 };
 
@@ -33,6 +34,28 @@ pub enum Problem {
     NoSuchSession {
         /// The name in the address.
         session: String,
+    },
+    /// The address names a cell of the shared map that no drive ever touched, or that is none.
+    #[error("nothing is known of cell {cell:?}; /cells lists those that there are")]
+    NoSuchCell {
+        /// The name in the address.
+        cell: String,
+    },
+    /// The address names a tile that is none, or is not served.
+    #[error("there is no tile {tile:?} here: {limit}")]
+    NoSuchTile {
+        /// The name in the address.
+        tile: String,
+        /// Which tiles there are.
+        limit: String,
+    },
+    /// Changes were asked for since a version that is not kept.
+    #[error("{reason}")]
+    VersionNotKept {
+        /// Which versions are.
+        reason: String,
+        /// Address of the cell as a whole.
+        whole: String,
     },
     /// Degrees were asked of a session that has none.
     #[error(
@@ -112,7 +135,11 @@ impl Problem {
     #[must_use]
     pub fn status(&self) -> StatusCode {
         match self {
-            Self::NoSuchPath { .. } | Self::NoSuchSession { .. } => StatusCode::NOT_FOUND,
+            Self::NoSuchPath { .. }
+            | Self::NoSuchSession { .. }
+            | Self::NoSuchCell { .. }
+            | Self::NoSuchTile { .. } => StatusCode::NOT_FOUND,
+            Self::VersionNotKept { .. } => StatusCode::GONE,
             Self::MethodNotAllowed { .. } => StatusCode::METHOD_NOT_ALLOWED,
             Self::NotGeoreferenced { .. } => StatusCode::CONFLICT,
             Self::Unauthenticated(_) => StatusCode::UNAUTHORIZED,
@@ -146,6 +173,9 @@ impl Problem {
             Self::NoSuchPath { .. } => ("no-such-path", "No such path"),
             Self::MethodNotAllowed { .. } => ("method-not-allowed", "Method not allowed"),
             Self::NoSuchSession { .. } => ("no-such-session", "No such session"),
+            Self::NoSuchCell { .. } => ("no-such-cell", "No such cell"),
+            Self::NoSuchTile { .. } => ("no-such-tile", "No such tile"),
+            Self::VersionNotKept { .. } => ("version-not-kept", "The version is not kept"),
             Self::NotGeoreferenced { .. } => ("not-georeferenced", "The session is not georeferenced"),
             Self::UnknownParameter { .. } => ("unknown-parameter", "Unknown query parameter"),
             Self::RepeatedParameter { .. } => ("repeated-parameter", "Repeated query parameter"),
@@ -171,6 +201,7 @@ impl Problem {
             },
             alternate: match self {
                 Self::NotGeoreferenced { session } => Some(format!("/sessions/{session}/lanes.geojson?crs=local")),
+                Self::VersionNotKept { whole, .. } => Some(whole.clone()),
                 _ => None,
             },
         }
@@ -203,6 +234,13 @@ impl From<ServiceError> for Problem {
                 Self::Internal
             }
         }
+    }
+}
+
+impl From<JournalError> for Problem {
+    fn from(error: JournalError) -> Self {
+        tracing::error!(%error, "an answer could not be made");
+        Self::Internal
     }
 }
 

@@ -1,6 +1,6 @@
 //! `/sessions`: which drives there are, and the lanes of each.
 
-use std::sync::Arc;
+use std::{collections::BTreeSet, sync::Arc};
 
 use axum::{
     Json,
@@ -31,7 +31,7 @@ use crate::{
 /// Media type of GeoJSON.
 pub(super) const GEOJSON: &str = "application/geo+json";
 /// Media type of protobuf.
-const PROTOBUF: &str = "application/x-protobuf";
+pub(super) const PROTOBUF: &str = "application/x-protobuf";
 
 /// A link to a related resource.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -67,6 +67,9 @@ struct Entry {
     frames: u64,
     /// Whether the session has a place on the earth; without one, the members below are metres of its map frame.
     georeferenced: bool,
+    /// Whether it is in the shared map: `shared map`, `own frame` without a place on the earth, or `kept apart` where it
+    /// fits no other drive, or not in one place only.
+    placement: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     last_frame_at: Option<String>,
     /// West, south, east and north border of its lanes.
@@ -102,13 +105,17 @@ pub(super) async fn list(
     let more = maps.len() > limit;
     maps.truncate(limit);
 
-    let parts: Vec<_> = maps.iter().map(|map| (identity(map), map.state as u8)).collect();
+    let cells = state.map.list();
+    let kept_apart: BTreeSet<SessionId> =
+        cells.iter().flat_map(|(_, record)| record.kept_apart.iter().copied()).collect();
+    let apart = |map: &SessionSummary| kept_apart.contains(&map.session);
+    let parts: Vec<_> = maps.iter().map(|map| (identity(map), map.state as u8, apart(map))).collect();
     let tag = EntityTag::of((total, limit, more, parts));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
     let page = in_background(move || {
-        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents)).collect();
+        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents, &kept_apart)).collect();
         let last = sessions.last().filter(|_| more);
         let next = last.map(|last| Link {
             rel: "next",
@@ -125,7 +132,7 @@ pub(super) fn identity(map: &SessionSummary) -> (u64, u64, bool) {
     (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
 }
 
-fn entry(map: &SessionSummary, extents: &Extents) -> Entry {
+fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionId>) -> Entry {
     let path = format!("/sessions/{}", map.session);
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
@@ -143,6 +150,11 @@ fn entry(map: &SessionSummary, extents: &Extents) -> Entry {
         lanes: map.lanes,
         frames: map.version.0,
         georeferenced: map.georeference.is_some(),
+        placement: match map.georeference {
+            None => "own frame",
+            Some(_) if kept_apart.contains(&map.session) => "kept apart",
+            Some(_) => "shared map",
+        },
         last_frame_at: map.last_sequence.map(|_| rfc3339(map.last_time)),
         bbox: border(map, extents),
         vehicle: map.last_sequence.map(|_| vehicle(map)),
@@ -266,7 +278,7 @@ mod tests {
     fn a_session_that_has_seen_no_frame_has_neither_border_nor_vehicle() {
         let mut map = published(1, 0);
         map.summary.last_sequence = None;
-        let entry = serde_json::to_value(entry(&map, &Extents::default())).unwrap();
+        let entry = serde_json::to_value(entry(&map, &Extents::default(), &BTreeSet::new())).unwrap();
         assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
         assert_eq!(entry["state"], "live");
     }

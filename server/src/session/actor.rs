@@ -34,6 +34,7 @@ use super::{
 use crate::{
     config::ServerConfig,
     error::Error,
+    fuse::Fuser,
     ingest::Outbox,
     journal::{Journal, JournalError, JournalFrame, Snapshot},
     privacy::Pseudonyms,
@@ -53,6 +54,7 @@ pub(crate) struct Surroundings {
     pub(crate) journal: Journal,
     pub(crate) pseudonyms: Pseudonyms,
     pub(crate) sessions: Sessions,
+    pub(crate) fuser: Fuser,
     pub(crate) in_flight: InFlightBudget,
     pub(crate) shutdown: CancellationToken,
 }
@@ -439,7 +441,10 @@ impl Actor {
             self.unpublished = false;
             return;
         }
-        self.surroundings.sessions.publish(self.drive.published(self.record.id, state));
+        let published = self.drive.published(self.record.id, state);
+        let in_shared_map = self.surroundings.pseudonyms.in_shared_map(self.record.drive);
+        self.surroundings.fuser.offer(self.drive.offer(in_shared_map, &self.record, &published));
+        self.surroundings.sessions.publish(published);
         let now = Instant::now();
         self.next_publication = now + self.publication_pause(now - started);
         self.unpublished = false;

@@ -2,7 +2,10 @@
 
 use std::sync::Arc;
 
-use lanemap_core::{Frame, Mapper, Params, Sequence, SnapshotError, StepReport, TimestampNs};
+use lanemap_core::{
+    Frame, Mapper, Params, Sequence, SnapshotError, StepReport, TimestampNs,
+    fleet::{DriveId, Trace},
+};
 use lanemap_proto::v1::RefusalReason;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -12,6 +15,7 @@ use super::{
     recent::{REMEMBERED, RecentFrames, Recollection},
 };
 use crate::{
+    fuse::Offer,
     ingest::Refusal,
     journal::{Journal, JournalError, frame_bytes},
     privacy::{
@@ -24,6 +28,8 @@ use crate::{
 #[derive(Debug)]
 pub(crate) struct Drive {
     mapper: Mapper,
+    /// The way so far, of what was mapped.
+    trace: Arc<Trace>,
     progress: Progress,
     cut: TripCut,
     ends: Ends,
@@ -131,21 +137,23 @@ impl Drive {
     /// A drive that has had no frame.
     pub(crate) fn new(setup: &SessionSetup, cut: TripCut) -> Self {
         let mapper = Mapper::new(Params::preset(setup.preset), setup.sensor);
-        Self { mapper, progress: Progress::default(), cut, ends: Ends::default(), mapped: None }
+        let (progress, ends) = (Progress::default(), Ends::default());
+        Self { mapper, trace: Arc::default(), progress, cut, ends, mapped: None }
     }
 
     /// The drive of [`Drive::snapshot`]'s bytes.
     pub(crate) fn restore(bytes: &[u8], cut: TripCut) -> Result<Self, DriveError> {
         let ((progress, mapper), rest): ((Progress, Vec<u8>), _) = postcard::take_from_bytes(bytes)?;
-        // Snapshots of earlier builds end here.
-        let ends = if rest.is_empty() { Ends::default() } else { postcard::from_bytes(rest)? };
+        // Snapshots of earlier builds end here, or after the next part.
+        let (ends, rest) = part_of(rest)?;
+        let (trace, _) = part_of(rest)?;
         let mapped = progress.last;
-        Ok(Self { mapper: Mapper::restore(&mapper)?, progress, cut, ends, mapped })
+        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace), progress, cut, ends, mapped })
     }
 
     /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
     pub(crate) fn snapshot(&self) -> Result<Vec<u8>, DriveError> {
-        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot(), &self.ends))?)
+        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot(), &self.ends, &*self.trace))?)
     }
 
     /// How far the drive has come, as bytes, where every frame since the last snapshot was cut.
@@ -221,7 +229,9 @@ impl Drive {
             self.ends.settled = Some(frame.sequence());
             self.ends.mapped = Some((frame.sequence(), frame.time()));
         }
-        self.mapper.step(frame)
+        let report = self.mapper.step(frame);
+        Arc::make_mut(&mut self.trace).observe(frame, &self.mapper.map_from_vehicle());
+        report
     }
 
     /// Whether frames are held back before they are mapped.
@@ -310,6 +320,24 @@ impl Drive {
         };
         PublishedMap::new(summary, Arc::new(self.mapper.lane_map()))
     }
+
+    /// What the drive, by this name, says to the shared map with what it publishes.
+    pub(crate) fn offer(&self, drive: DriveId, record: &SessionRecord, published: &PublishedMap) -> Offer {
+        Offer {
+            session: record.id,
+            drive,
+            version: published.version,
+            georeference: published.georeference,
+            sensor: record.setup.sensor,
+            trace: Arc::clone(&self.trace),
+            map: Arc::clone(&published.map),
+        }
+    }
+}
+
+/// The next part of a snapshot, and what comes after it; the part's default where the snapshot ends before it.
+fn part_of<'a, T: Deserialize<'a> + Default>(bytes: &'a [u8]) -> Result<(T, &'a [u8]), postcard::Error> {
+    if bytes.is_empty() { Ok((T::default(), bytes)) } else { postcard::take_from_bytes(bytes) }
 }
 
 #[cfg(test)]
@@ -374,5 +402,21 @@ mod tests {
         let mut restored = Drive::restore(&drive.snapshot().unwrap(), TripCut::default()).unwrap();
         assert_eq!(admit(&mut restored, 5, 100), Admission::Repeated);
         assert_eq!(restored.progress.mapped, 1);
+        assert_eq!(restored.trace, drive.trace);
+        assert_eq!(restored.trace.points().len(), 1);
+    }
+
+    #[test]
+    fn snapshots_of_earlier_builds_are_restored_without_what_they_have_not() {
+        let mut drive = drive();
+        admit(&mut drive, 5, 100);
+        let first = postcard::to_stdvec(&(&drive.progress, drive.mapper.snapshot())).unwrap();
+        let second = postcard::to_stdvec(&(&drive.progress, drive.mapper.snapshot(), &drive.ends)).unwrap();
+        for bytes in [first, second] {
+            let mut restored = Drive::restore(&bytes, TripCut::default()).unwrap();
+            assert_eq!(restored.trace.points().len(), 0);
+            assert_eq!(admit(&mut restored, 6, 200), Admission::New);
+            assert_eq!(restored.trace.points().len(), 1);
+        }
     }
 }

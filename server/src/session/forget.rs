@@ -10,7 +10,7 @@ use tokio::sync::OwnedMutexGuard;
 
 use super::{
     SessionId, SessionKey,
-    actor::Command,
+    actor::{Command, Surroundings},
     registry::{SessionRegistry, Slot, locked},
 };
 use crate::{
@@ -108,13 +108,16 @@ impl SessionRegistry {
             held.push(self.hold(forgotten.drive).await);
         }
         let sessions: Vec<SessionId> = held.iter().filter_map(|slot| Some(slot.record.as_ref()?.id)).collect();
-        self.shared.surroundings.journal.forget(sessions.clone(), drives.to_vec(), outdated).await?;
+        let Surroundings { journal, fuser, .. } = &self.shared.surroundings;
+        fuser.drop_offers(&sessions).await;
+        journal.forget(sessions.clone(), drives.to_vec(), outdated).await?;
         for forgotten in drives {
             self.remove(forgotten.drive);
         }
         for session in &sessions {
             self.shared.surroundings.sessions.remove(session);
         }
+        fuser.fuse_without(&sessions).await;
         Ok(sessions.len())
     }
 

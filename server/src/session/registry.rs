@@ -151,17 +151,20 @@ impl SessionRegistry {
         Ok(Self { shared: Arc::new(shared) })
     }
 
-    /// Wakes the drives that have frames after their snapshot, one after the other: a crash left them so, or they hold
-    /// frames of a trip that may be over. They fall asleep again, with a new snapshot, unless their vehicles come back.
+    /// Wakes the drives that have frames after their snapshot, or more than they said to the shared map, one after the
+    /// other: a crash left them so, or they hold frames of a trip that may be over. They fall asleep again, with a new snapshot, unless their vehicles come back.
     pub(crate) async fn wake_unsaved(&self) -> Result<(), Error> {
-        let Surroundings { journal, sessions, .. } = self.shared.surroundings.clone();
-        let told: HashMap<_, _> = sessions.list().iter().map(|told| (told.session, told.last_sequence)).collect();
+        let Surroundings { journal, sessions, fuser, .. } = self.shared.surroundings.clone();
+        let listed = sessions.list();
+        let told: HashMap<_, _> = listed.iter().map(|told| (told.session, told.last_sequence)).collect();
         let find = move || {
             let records = journal.records()?.into_iter();
             // Nothing is told of one that is hidden.
             journal.with_frames_after(records.map(|record| (record.id, told.get(&record.id).copied().flatten())))
         };
-        let unsaved: HashSet<_> = blocking(find).await?.into_iter().collect();
+        let mut unsaved: HashSet<_> = blocking(find).await?.into_iter().collect();
+        let on_earth = listed.iter().filter(|told| told.georeference.is_some());
+        unsaved.extend(on_earth.filter(|told| fuser.is_behind(told.session, told.version)).map(|told| told.session));
         let slots: Vec<_> = locked(&self.shared.slots).values().map(|place| Arc::clone(&place.slot)).collect();
         for slot in slots {
             let mut slot = slot.lock().await;

@@ -7,6 +7,7 @@ use lanemap_proto::v1::{self, stream_observations_response::Message};
 use super::*;
 use crate::{
     config::ServerConfig,
+    fuse::{FuseSettings, Fuser, SharedMap},
     ingest::{OutboxStream, decode::PointFrame},
     journal::JournalOptions,
     session::{SessionSetup, Sessions, in_flight::InFlightBudget},
@@ -15,7 +16,9 @@ use crate::{
 /// No session yet, and a store in `folder`.
 async fn registry(folder: &Path, config: ServerConfig) -> SessionRegistry {
     let (journal, _) = Journal::open(&JournalOptions::new(folder)).unwrap();
+    let map = SharedMap::new(1 << 20);
     let surroundings = Surroundings {
+        fuser: Fuser::start(FuseSettings::of(&config), &journal.cells(), map).unwrap().fuser(),
         journal,
         pseudonyms: Pseudonyms::open(&folder.join("key"), None).unwrap(),
         sessions: Sessions::new(1 << 20),

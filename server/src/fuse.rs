@@ -1,0 +1,213 @@
+//! The shared map in the service: drives contribute to cells, and cells are fused in the background.
+//!
+//! 1. A session's actor [`offers`](Fuser::offer) what its drive says each time it publishes; the newest offer counts.
+//! 2. A worker cuts the offer into [contributions](offer) per cell and puts those that changed into the store.
+//! 3. A cell whose contributions are not those that it was fused from is dirty: a worker fuses it (`lanemap_core::fleet::fuse`),
+//!    [cuts](border) its lines at the tile's border, and joins them with those of its neighbours.
+//! 4. Where its [bytes](wire) differ, a new version is made durable and [swapped in](shared_map) for readers.
+//!
+//! Workers are threads of their own, never the runtime's; they take tasks in the order in which these became due
+//! ([`queue`]), and rest in between, so that they take no more than a share of a core. What a cell is fused from is its
+//! fingerprint: it is kept, and a start fuses nothing again that has not changed.
+
+pub(crate) mod border;
+mod cell_record;
+pub(crate) mod offer;
+mod queue;
+pub mod shared_map;
+pub mod wire;
+mod worker;
+
+use std::{
+    collections::BTreeSet,
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::{self, JoinHandle},
+    time::{Duration, Instant},
+};
+
+use lanemap_core::fleet::CellId;
+use tokio::sync::watch;
+
+pub use cell_record::{CellRecord, CellVersion};
+pub(crate) use offer::Offer;
+pub use shared_map::{ChangesError, PublishedCell, SharedMap};
+
+use crate::{
+    config::ServerConfig,
+    journal::{JournalError, cells::CellStore},
+    session::{MapVersion, SessionId},
+};
+use cell_record::fingerprint;
+use queue::Queue;
+use worker::Worker;
+
+/// Settings of the fuser.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FuseSettings {
+    pub(crate) threads: usize,
+    pub(crate) interval: Duration,
+    pub(crate) cpu_share: f64,
+    pub(crate) max_contributions: usize,
+    pub(crate) versions_kept: Duration,
+}
+
+impl FuseSettings {
+    pub(crate) fn of(config: &ServerConfig) -> Self {
+        Self {
+            threads: config.fuse_threads,
+            interval: Duration::from_millis(config.fuse_interval_ms),
+            cpu_share: config.fuse_cpu_share,
+            max_contributions: config.max_contributions_per_cell,
+            versions_kept: Duration::from_secs(config.cell_versions_kept_s),
+        }
+    }
+}
+
+/// Takes what drives say and keeps the cells fused. Clones share it.
+#[derive(Clone, Debug)]
+pub(crate) struct Fuser {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    settings: FuseSettings,
+    map: SharedMap,
+    queue: Mutex<Queue>,
+    /// Told when there is more in the queue, or nothing more will come.
+    woken: Condvar,
+    stopping: AtomicBool,
+    /// Counts tasks that were done.
+    done: watch::Sender<u64>,
+}
+
+/// The threads that fuse.
+#[derive(Debug)]
+pub(crate) struct FuseThreads {
+    fuser: Fuser,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Fuser {
+    /// Reads what is told of every cell, finds out which are dirty, and starts the threads. Reads the disk.
+    pub(crate) fn start(
+        settings: FuseSettings,
+        store: &CellStore,
+        map: SharedMap,
+    ) -> Result<FuseThreads, JournalError> {
+        let records = store.told::<CellRecord>()?;
+        let facts = store.facts()?;
+        let purges: BTreeSet<CellId> = store.purges()?.into_iter().collect();
+        let now = Instant::now();
+        let mut queue = Queue::new(settings.interval);
+        let dirty = |cell: &CellId| {
+            let fused_from = records.get(cell).map(|record| record.fingerprint);
+            let now = facts.get(cell).map(|facts| fingerprint(facts.values()));
+            fused_from != now.or(fused_from.map(|_| fingerprint([]))) || purges.contains(cell)
+        };
+        let cells: BTreeSet<CellId> = records.keys().chain(facts.keys()).chain(&purges).copied().collect();
+        for cell in cells.into_iter().filter(dirty) {
+            queue.touch_cell(cell, now);
+        }
+        for (session, contributed) in store.contributed()? {
+            queue.has_contributed(session, contributed);
+        }
+        map.begin(records, store.clone());
+        let shared = Shared {
+            settings,
+            map,
+            queue: Mutex::new(queue),
+            woken: Condvar::new(),
+            stopping: AtomicBool::new(false),
+            done: watch::Sender::default(),
+        };
+        let fuser = Self { shared: Arc::new(shared) };
+        fuser.tell_dirty(&fuser.queue());
+        let threads = (0..settings.threads).map(|number| {
+            let worker = Worker::new(fuser.clone(), store.clone());
+            let builder = thread::Builder::new().name(format!("lanemap-fuse-{number}"));
+            let spawned = builder.spawn(move || worker.run());
+            spawned.map_err(|error| JournalError::Store(format!("a fusing thread does not start: {error}")))
+        });
+        Ok(FuseThreads { threads: threads.collect::<Result<_, _>>()?, fuser })
+    }
+
+    /// Takes what a drive says now, in the place of what it said before. Does not wait.
+    pub(crate) fn offer(&self, offer: Offer) {
+        let mut queue = self.queue();
+        if queue.offer(offer, Instant::now()) {
+            self.tell_dirty(&queue);
+            self.shared.woken.notify_all();
+        }
+    }
+
+    /// Whether the cells do not have all of a session's map of this version, as far as they are told.
+    pub(crate) fn is_behind(&self, session: SessionId, version: MapVersion) -> bool {
+        self.queue().contributed(session).is_none_or(|contributed| contributed.version != version)
+    }
+
+    /// Drops what sessions have offered, which are being deleted; waits where some of it is in work. They offer nothing
+    /// more.
+    pub(crate) async fn drop_offers(&self, sessions: &[SessionId]) {
+        self.wait_until(|queue| sessions.iter().all(|session| queue.drop_offer(*session))).await;
+    }
+
+    /// Fuses the cells to which deleted sessions contributed, now that the store has nothing of them.
+    pub(crate) async fn fuse_without(&self, sessions: &[SessionId]) {
+        let cells: Vec<CellId> = {
+            let mut queue = self.queue();
+            let cells: BTreeSet<CellId> =
+                sessions.iter().filter_map(|session| queue.forget(*session)).flat_map(|left| left.cells).collect();
+            for cell in &cells {
+                queue.touch_cell(*cell, Instant::now());
+            }
+            self.tell_dirty(&queue);
+            cells.into_iter().collect()
+        };
+        self.shared.woken.notify_all();
+        self.wait_until(|queue| cells.iter().all(|cell| !queue.is_dirty(*cell))).await;
+    }
+
+    /// Waits until the queue is as it should be, or nothing is done any more.
+    async fn wait_until(&self, holds: impl Fn(&mut Queue) -> bool) {
+        let mut done = self.shared.done.subscribe();
+        while !holds(&mut self.queue()) && !self.is_stopping() && self.shared.settings.threads > 0 {
+            if done.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.shared.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn is_stopping(&self) -> bool {
+        self.shared.stopping.load(Ordering::Relaxed)
+    }
+
+    /// Tells readers which cells are dirty, and how many drives wait.
+    fn tell_dirty(&self, queue: &Queue) {
+        self.shared.map.tell_waiting(queue.dirty_cells(), queue.waiting_offers());
+    }
+}
+
+impl FuseThreads {
+    pub(crate) fn fuser(&self) -> Fuser {
+        self.fuser.clone()
+    }
+
+    /// Ends the threads once what drives have offered is in the store; dirty cells are fused after the next start.
+    pub(crate) async fn stop(self) {
+        self.fuser.shared.stopping.store(true, Ordering::Relaxed);
+        self.fuser.shared.woken.notify_all();
+        let join = move || self.threads.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
+        match tokio::task::spawn_blocking(join).await {
+            Ok(0) => {}
+            _ => tracing::error!("a fusing thread has failed"),
+        }
+    }
+}

@@ -1,0 +1,258 @@
+//! What readers see of the shared map: whole versions of its cells, swapped in at once.
+//!
+//! Of every cell what is told of it stays in memory; its lines are read from the store when somebody asks for them, and kept
+//! in a cache of bounded size. A reader holds one version for as long as it likes and never waits for a fusion.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt,
+    sync::{Arc, PoisonError, RwLock},
+};
+
+use arc_swap::{ArcSwap, ArcSwapOption};
+use bytes::Bytes;
+use lanemap_core::fleet::CellId;
+use lanemap_proto::v1;
+use prost::Message;
+use quick_cache::{Weighter, sync::Cache};
+use thiserror::Error;
+use tokio::sync::watch;
+
+use super::{
+    CellRecord, CellVersion,
+    wire::{changes, empty_cell},
+};
+use crate::{
+    journal::{JournalError, cells::CellStore},
+    telemetry,
+};
+
+/// Attempts to read a version before it gives way to the next.
+const ATTEMPTS: usize = 8;
+
+/// One version of a cell.
+#[derive(Clone, Debug)]
+pub struct PublishedCell {
+    /// What is told of it.
+    pub record: Arc<CellRecord>,
+    /// Its lines.
+    pub map: v1::CellMap,
+    /// The bytes of `map`: the same for the same version.
+    pub bytes: Bytes,
+}
+
+/// Why changes cannot be told.
+#[derive(Clone, Debug, Error)]
+pub enum ChangesError {
+    /// No drive ever touched the cell.
+    #[error("nothing is known of cell {cell}")]
+    NoSuchCell {
+        /// The cell.
+        cell: CellId,
+    },
+    /// The version is not kept any more, or not there yet.
+    #[error(
+        "version {since} of cell {cell} is not kept: it is at {newest}, and the oldest that is kept is {oldest}; take the cell whole"
+    )]
+    NotKept {
+        /// The cell.
+        cell: CellId,
+        /// The version that was asked for.
+        since: u64,
+        /// The oldest version that is kept.
+        oldest: u64,
+        /// The newest version.
+        newest: u64,
+    },
+    /// The store cannot be read.
+    #[error(transparent)]
+    Store(#[from] JournalError),
+}
+
+/// The cells of the shared map. Clones share them.
+#[derive(Clone)]
+pub struct SharedMap {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    cells: RwLock<BTreeMap<CellId, Arc<CellRecord>>>,
+    read: Cache<(CellId, CellVersion), Arc<PublishedCell>, MemoryWeight>,
+    store: ArcSwapOption<CellStore>,
+    waiting: ArcSwap<Waiting>,
+    publications: watch::Sender<u64>,
+}
+
+/// What is not in the map yet.
+#[derive(Clone, Debug, Default)]
+struct Waiting {
+    dirty: BTreeSet<CellId>,
+    drives: usize,
+}
+
+/// Bytes that a cell takes in memory.
+#[derive(Clone)]
+struct MemoryWeight;
+
+impl Weighter<(CellId, CellVersion), Arc<PublishedCell>> for MemoryWeight {
+    fn weight(&self, _: &(CellId, CellVersion), cell: &Arc<PublishedCell>) -> u64 {
+        // Numbers that are one or two bytes on the wire are four in memory.
+        (4 * cell.bytes.len() + 256 * cell.map.lanes.len() + 512) as u64
+    }
+}
+
+impl fmt::Debug for SharedMap {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("SharedMap").finish_non_exhaustive()
+    }
+}
+
+impl SharedMap {
+    /// A map without cells, whose lines take at most `cache_bytes`.
+    #[must_use]
+    pub fn new(cache_bytes: usize) -> Self {
+        let shared = Shared {
+            cells: RwLock::default(),
+            read: Cache::with_weighter(64, cache_bytes as u64, MemoryWeight),
+            store: ArcSwapOption::empty(),
+            waiting: ArcSwap::default(),
+            publications: watch::Sender::default(),
+        };
+        Self { shared: Arc::new(shared) }
+    }
+
+    /// Begins with what the store has.
+    pub(super) fn begin(&self, records: BTreeMap<CellId, CellRecord>, store: CellStore) {
+        let records = records.into_iter().map(|(cell, record)| (cell, Arc::new(record)));
+        *self.shared.cells.write().unwrap_or_else(PoisonError::into_inner) = records.collect();
+        self.shared.store.store(Some(Arc::new(store)));
+        self.count();
+    }
+
+    /// Reads no more from the store, which is to be closed.
+    pub(crate) fn let_go_of_store(&self) {
+        self.shared.store.store(None);
+    }
+
+    /// What is told of every cell, in their order.
+    #[must_use]
+    pub fn list(&self) -> Vec<(CellId, Arc<CellRecord>)> {
+        let cells = self.shared.cells.read().unwrap_or_else(PoisonError::into_inner);
+        cells.iter().map(|(cell, record)| (*cell, Arc::clone(record))).collect()
+    }
+
+    /// What is told of one cell.
+    #[must_use]
+    pub fn record(&self, cell: CellId) -> Option<Arc<CellRecord>> {
+        self.shared.cells.read().unwrap_or_else(PoisonError::into_inner).get(&cell).map(Arc::clone)
+    }
+
+    /// Whether drives have said something of a cell that is not in its map yet.
+    #[must_use]
+    pub fn is_dirty(&self, cell: CellId) -> bool {
+        self.shared.waiting.load().dirty.contains(&cell)
+    }
+
+    /// Whether all that drives have said up to now is in the map.
+    #[must_use]
+    pub fn is_settled(&self) -> bool {
+        let waiting = self.shared.waiting.load();
+        waiting.dirty.is_empty() && waiting.drives == 0
+    }
+
+    /// The newest version of a cell, where drives have touched it. Reads the store where it is not in the cache, which
+    /// takes milliseconds: not for a task of the runtime.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn get(&self, cell: CellId) -> Result<Option<Arc<PublishedCell>>, JournalError> {
+        for _ in 0..ATTEMPTS {
+            let Some(record) = self.record(cell) else { return Ok(None) };
+            let read = || self.read(cell, &record)?.map(Arc::new).ok_or(ReadError::Outdated);
+            match self.shared.read.get_or_insert_with(&(cell, record.version), read) {
+                Ok(found) => return Ok(Some(found)),
+                Err(ReadError::Store(error)) => return Err(error),
+                // The next version has taken its place meanwhile.
+                Err(ReadError::Outdated) => {}
+            }
+        }
+        Err(JournalError::Store(format!("cell {cell} changes faster than it can be read")))
+    }
+
+    fn read(&self, cell: CellId, record: &Arc<CellRecord>) -> Result<Option<PublishedCell>, ReadError> {
+        let Some(map) = self.version(cell, record.version.0)? else { return Ok(None) };
+        let bytes = map.encode_to_vec().into();
+        Ok(Some(PublishedCell { record: Arc::clone(record), map, bytes }))
+    }
+
+    /// One version of a cell, where it is kept; version 0 is empty.
+    fn version(&self, cell: CellId, version: u64) -> Result<Option<v1::CellMap>, JournalError> {
+        if version == 0 {
+            return Ok(Some(empty_cell(cell)));
+        }
+        let store = self.shared.store.load_full().ok_or(JournalError::Closed)?;
+        let Some(bytes) = store.version(cell, version)? else { return Ok(None) };
+        let map = v1::CellMap::decode(bytes.as_slice());
+        map.map(Some).map_err(|error| JournalError::Decode { what: format!("cell {cell}"), reason: error.to_string() })
+    }
+
+    /// What changed in a cell since a version. Reads the store.
+    ///
+    /// # Errors
+    /// No such cell, a version that is not kept, or a store that cannot be read.
+    pub fn changes_since(&self, cell: CellId, since: u64) -> Result<v1::CellChanges, ChangesError> {
+        let newest = self.get(cell)?.ok_or(ChangesError::NoSuchCell { cell })?;
+        let now = newest.map.version;
+        let before = if since <= now { self.version(cell, since)? } else { None };
+        let Some(before) = before else {
+            let store = self.shared.store.load_full().ok_or(JournalError::Closed)?;
+            let oldest = store.versions(cell)?.first().map_or(now, |(version, _)| *version);
+            return Err(ChangesError::NotKept { cell, since, oldest, newest: now });
+        };
+        Ok(changes(&before, &newest.map))
+    }
+
+    /// Makes a version, which is on the disk, the newest of its cell.
+    pub(super) fn publish(&self, cell: CellId, record: CellRecord, map: Option<(v1::CellMap, Bytes)>) {
+        let record = Arc::new(record);
+        if let Some((map, bytes)) = map {
+            let published = PublishedCell { record: Arc::clone(&record), map, bytes };
+            self.shared.read.insert((cell, record.version), Arc::new(published));
+        }
+        let mut cells = self.shared.cells.write().unwrap_or_else(PoisonError::into_inner);
+        let before = cells.insert(cell, Arc::clone(&record));
+        metrics::gauge!(telemetry::CELLS).set(cells.len() as f64);
+        drop(cells);
+        if let Some(before) = before.filter(|before| before.version != record.version) {
+            self.shared.read.remove(&(cell, before.version));
+        }
+        self.count();
+    }
+
+    pub(super) fn tell_waiting(&self, dirty: BTreeSet<CellId>, drives: usize) {
+        metrics::gauge!(telemetry::CELLS_DIRTY).set(dirty.len() as f64);
+        self.shared.waiting.store(Arc::new(Waiting { dirty, drives }));
+        self.count();
+    }
+
+    /// Counts what readers may see: tells one that something is newer than when it looked.
+    #[must_use]
+    pub fn publications(&self) -> watch::Receiver<u64> {
+        self.shared.publications.subscribe()
+    }
+
+    fn count(&self) {
+        self.shared.publications.send_modify(|count| *count += 1);
+    }
+}
+
+enum ReadError {
+    Store(JournalError),
+    Outdated,
+}
+
+impl From<JournalError> for ReadError {
+    fn from(error: JournalError) -> Self {
+        Self::Store(error)
+    }
+}

@@ -1,0 +1,297 @@
+//! A thread that cuts drives into contributions and fuses cells, one task after the other.
+
+use std::{
+    sync::PoisonError,
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use lanemap_core::fleet::{CellId, Contribution, DriveId, FleetParams, FusedMap, fuse};
+use lanemap_proto::v1;
+use prost::Message;
+
+use super::{
+    CellRecord, CellVersion, Fuser, Offer,
+    border::{self, Crossing, Piece},
+    cell_record::fingerprint,
+    queue::{Taken, Task},
+    wire,
+};
+use crate::{
+    journal::{
+        JournalError,
+        cells::{CellStore, CellWrite, Contributed, ContributionFact, Facts, NewVersion, encoded},
+    },
+    session::SessionId,
+    telemetry,
+};
+
+/// Most versions of a cell that are kept, however young.
+const MOST_VERSIONS: usize = 128;
+/// Pause after a task that could not be done.
+const RETRY_PAUSE: Duration = Duration::from_secs(1);
+
+pub(super) struct Worker {
+    fuser: Fuser,
+    store: CellStore,
+}
+
+/// A cell as it was fused.
+struct Fused {
+    pieces: Vec<Piece>,
+    crossings: Vec<Crossing>,
+    map: FusedMap,
+    took: Duration,
+}
+
+impl Worker {
+    pub(super) fn new(fuser: Fuser, store: CellStore) -> Self {
+        Self { fuser, store }
+    }
+
+    /// Works until the service stops; then puts what drives have offered into the store, and ends.
+    pub(super) fn run(self) {
+        while let Some(taken) = self.next() {
+            let started = Instant::now();
+            let task = match &taken {
+                Taken::Contribute(offer) => Task::Contribute(offer.session),
+                Taken::Fuse(cell) => Task::Fuse(*cell),
+            };
+            let outcome = match &taken {
+                Taken::Contribute(offer) => self.contribute(offer),
+                Taken::Fuse(cell) => self.fuse(*cell),
+            };
+            let mut queue = self.fuser.queue();
+            match outcome {
+                Ok(()) => queue.finish(task, Instant::now()),
+                Err(error) if self.fuser.is_stopping() => {
+                    // The next start finds out what is missing.
+                    tracing::warn!(%error, "the shared map could not be brought up to date");
+                    queue.finish(task, Instant::now());
+                }
+                Err(error) => {
+                    tracing::error!(%error, "the shared map cannot be brought up to date, and is tried again");
+                    queue.retry(taken, Instant::now(), RETRY_PAUSE);
+                }
+            }
+            self.fuser.tell_dirty(&queue);
+            drop(queue);
+            self.fuser.shared.woken.notify_all();
+            self.fuser.shared.done.send_modify(|count| *count += 1);
+            self.rest(started.elapsed());
+        }
+    }
+
+    /// Waits for the next task; `None` where none will come.
+    fn next(&self) -> Option<Taken> {
+        let mut queue = self.fuser.queue();
+        loop {
+            let stopping = self.fuser.is_stopping();
+            let woken = &self.fuser.shared.woken;
+            match queue.take(Instant::now(), stopping) {
+                Ok(taken) => return Some(taken),
+                Err(_) if stopping => return None,
+                Err(None) => queue = woken.wait(queue).unwrap_or_else(PoisonError::into_inner),
+                Err(Some(at)) => {
+                    let pause = at.saturating_duration_since(Instant::now());
+                    queue = woken.wait_timeout(queue, pause).unwrap_or_else(PoisonError::into_inner).0;
+                }
+            }
+        }
+    }
+
+    /// Leaves the machine to others after work, so that fusing takes its share of a core and no more.
+    fn rest(&self, worked: Duration) {
+        let share = self.fuser.shared.settings.cpu_share;
+        let until = Instant::now() + worked.mul_f64(1.0 / share - 1.0);
+        let mut queue = self.fuser.queue();
+        while !self.fuser.is_stopping() && Instant::now() < until {
+            let pause = until.saturating_duration_since(Instant::now());
+            queue = self.fuser.shared.woken.wait_timeout(queue, pause).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Puts what a drive says into the store, where it is not what it said before.
+    fn contribute(&self, offer: &Offer) -> Result<(), JournalError> {
+        let started = Instant::now();
+        let session = offer.session;
+        let before = self.fuser.queue().contributed(session).cloned().unwrap_or_default();
+        let mut changed = offer.contributions()?;
+        let cells: Vec<CellId> = changed.iter().map(|contribution| contribution.cell).collect();
+        let left: Vec<CellId> =
+            before.cells.iter().filter(|cell| cells.binary_search(cell).is_err()).copied().collect();
+        let mut kept = Vec::with_capacity(changed.len());
+        for contribution in changed.drain(..) {
+            let known = self.store.facts_of(contribution.cell)?;
+            if known.get(&session) != Some(&contribution.fact)
+                && self.is_young_enough(&known, session, &contribution.fact)
+            {
+                kept.push(contribution);
+            }
+        }
+        let touched: Vec<CellId> =
+            kept.iter().map(|contribution| contribution.cell).chain(left.iter().copied()).collect();
+        let contributed = Contributed { version: offer.version, cells };
+        metrics::counter!(telemetry::CONTRIBUTIONS).increment(kept.len() as u64);
+        self.store.contribute(session, &contributed, kept, &left)?;
+        let mut queue = self.fuser.queue();
+        queue.has_contributed(session, contributed);
+        for cell in touched {
+            queue.touch_cell(cell, Instant::now());
+        }
+        drop(queue);
+        metrics::histogram!(telemetry::CONTRIBUTE_SECONDS).record(started.elapsed().as_secs_f64());
+        Ok(())
+    }
+
+    /// Whether a contribution is among those that its cell keeps: the youngest drives.
+    fn is_young_enough(&self, known: &Facts, session: SessionId, fact: &ContributionFact) -> bool {
+        let younger = known
+            .iter()
+            .filter(|(other, known)| **other != session && (known.started, known.drive) > (fact.started, fact.drive));
+        younger.count() < self.fuser.shared.settings.max_contributions
+    }
+
+    /// Brings a cell up to date: fuses it where it is not fused from what the store has, and joins it with its neighbours.
+    fn fuse(&self, cell: CellId) -> Result<(), JournalError> {
+        let mut facts = self.store.facts_of(cell)?;
+        let dropped = self.drop_oldest(&mut facts);
+        let before = self.fuser.shared.map.record(cell);
+        let before = before.as_deref().cloned().unwrap_or_default();
+        let purged = self.store.purges()?.contains(&cell);
+        let print = fingerprint(facts.values());
+        let fused = if before.fingerprint == print { None } else { Some(self.fuse_from(cell, &facts)?) };
+
+        let (pieces, crossings) = match &fused {
+            Some(fused) => (fused.pieces.clone(), fused.crossings.clone()),
+            None => (self.store.lines(cell)?, before.crossings.clone()),
+        };
+        let map = &self.fuser.shared.map;
+        let neighbours: Vec<(CellId, _)> =
+            cell.neighbours().into_iter().filter_map(|near| Some((near, map.record(near)?))).collect();
+        let joined = border::join(cell, pieces, &crossings, |near| {
+            let found = neighbours.iter().find(|(neighbour, _)| *neighbour == near);
+            found.map(|(_, record)| record.crossings.as_slice())
+        });
+        let lanes = wire::lanes(&joined);
+
+        let mut record = CellRecord { crossings, fingerprint: print, ..before.clone() };
+        record.lanes = u32::try_from(lanes.len()).unwrap_or(u32::MAX);
+        (record.line_m, record.median_lateral_sigma_m) = length_and_sigma(&lanes);
+        if let Some(fused) = &fused {
+            record.tell(fused, &facts);
+        }
+        let published = map.get(cell)?;
+        let is_same = published.is_some_and(|published| published.map.lanes == lanes);
+        let next = (!is_same).then(|| {
+            record.version = CellVersion(before.version.0 + 1);
+            let next = v1::CellMap { version: record.version.0, lanes, ..wire::empty_cell(cell) };
+            let bytes = next.encode_to_vec();
+            (next, bytes)
+        });
+        let write = CellWrite {
+            cell,
+            told: encoded("a cell", &record)?,
+            lines: fused.as_ref().map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
+            outdated: self.outdated(cell, next.is_some(), purged)?,
+            version: next.as_ref().map(|(map, bytes)| NewVersion {
+                version: map.version,
+                published_ms: now_ms(),
+                bytes: bytes.clone(),
+            }),
+            dropped,
+            purged,
+        };
+        if fused.is_some() || next.is_some() || purged {
+            self.store.put_cell(write)?;
+            map.publish(cell, record.clone(), next.map(|(map, bytes)| (map, bytes.into())));
+        }
+        self.tell_neighbours(cell, &before.crossings, &record.crossings);
+        Ok(())
+    }
+
+    /// Takes the oldest drives out, where there are more than a cell keeps.
+    fn drop_oldest(&self, facts: &mut Facts) -> Vec<SessionId> {
+        let excess = facts.len().saturating_sub(self.fuser.shared.settings.max_contributions);
+        let mut by_age: Vec<(_, SessionId)> = facts.iter().map(|(session, fact)| (*fact, *session)).collect();
+        by_age.sort_unstable();
+        let dropped: Vec<SessionId> = by_age.into_iter().take(excess).map(|(_, session)| session).collect();
+        for session in &dropped {
+            facts.remove(session);
+        }
+        dropped
+    }
+
+    fn fuse_from(&self, cell: CellId, facts: &Facts) -> Result<Fused, JournalError> {
+        let started = Instant::now();
+        let contributions: Vec<Contribution> = facts
+            .keys()
+            .filter_map(|session| self.store.contribution(cell, *session).transpose())
+            .collect::<Result<_, _>>()?;
+        let map = fuse(&contributions, &cell.anchor(), &FleetParams::default());
+        let (pieces, crossings) = border::cut(cell, &map.lanes);
+        let took = started.elapsed();
+        metrics::histogram!(telemetry::FUSE_SECONDS).record(took.as_secs_f64());
+        metrics::counter!(telemetry::CELLS_FUSED).increment(1);
+        Ok(Fused { pieces, crossings, map, took })
+    }
+
+    /// Versions of a cell that are no longer kept: replaced long ago, beyond the most, or with a deleted drive in them.
+    fn outdated(&self, cell: CellId, replaced: bool, purged: bool) -> Result<Vec<u64>, JournalError> {
+        if !replaced {
+            // The newest stays. A purge without a change has nothing of the deleted drive in it, but its past may.
+            let mut versions = if purged { self.store.versions(cell)? } else { Vec::new() };
+            versions.pop();
+            return Ok(versions.into_iter().map(|(version, _)| version).collect());
+        }
+        let versions = self.store.versions(cell)?;
+        let kept = self.fuser.shared.settings.versions_kept;
+        let since_ms = now_ms().saturating_sub(u64::try_from(kept.as_millis()).unwrap_or(u64::MAX));
+        let excess = versions.len().saturating_sub(MOST_VERSIONS - 1);
+        let replaced_ms = versions.iter().skip(1).map(|(_, published_ms)| *published_ms).chain([u64::MAX]);
+        let outdated = versions
+            .iter()
+            .zip(replaced_ms)
+            .enumerate()
+            .filter(|(index, (_, replaced_ms))| purged || *index < excess || *replaced_ms < since_ms);
+        Ok(outdated.map(|(_, ((version, _), _))| *version).collect())
+    }
+
+    /// Has the neighbours joined again whose border was changed.
+    fn tell_neighbours(&self, cell: CellId, before: &[Crossing], after: &[Crossing]) {
+        let map = &self.fuser.shared.map;
+        let changed = |near: &CellId| border::differ(before, after, *near) && map.record(*near).is_some();
+        let near: Vec<CellId> = cell.neighbours().into_iter().filter(changed).collect();
+        let mut queue = self.fuser.queue();
+        for near in near {
+            queue.touch_cell(near, Instant::now());
+        }
+    }
+}
+
+impl CellRecord {
+    fn tell(&mut self, fused: &Fused, facts: &Facts) {
+        self.fused_at_ms = now_ms();
+        self.fused_in_ms = u64::try_from(fused.took.as_millis()).unwrap_or(u64::MAX);
+        self.drives = u32::try_from(fused.map.drives.len()).unwrap_or(u32::MAX);
+        let apart: Vec<DriveId> =
+            fused.map.drives.iter().filter(|drive| drive.correction.is_none()).map(|drive| drive.drive).collect();
+        let is_apart = |fact: &ContributionFact| apart.contains(&fact.drive);
+        self.kept_apart = facts.iter().filter(|(_, fact)| is_apart(fact)).map(|(session, _)| *session).collect();
+    }
+}
+
+/// Length of all lanes, metres, and the median of the standard deviations across them, metres.
+fn length_and_sigma(lanes: &[v1::FusedLane]) -> (f64, f64) {
+    let length = |lane: &v1::FusedLane| -> f64 {
+        wire::positions(lane).windows(2).map(|pair| nalgebra::distance(&pair[0], &pair[1])).sum()
+    };
+    let mut sigmas: Vec<u32> = lanes.iter().flat_map(|lane| lane.lateral_sigma_mm.iter().copied()).collect();
+    sigmas.sort_unstable();
+    let median = sigmas.get(sigmas.len() / 2).map_or(0.0, |sigma| f64::from(*sigma) * 1e-3);
+    (lanes.iter().map(length).sum(), median)
+}
+
+fn now_ms() -> u64 {
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
+}

@@ -68,6 +68,7 @@ test("lanes are drawn and grow while vehicles drive, without a complaint or a re
   await page.locator('#connection[data-state="connected"]').waitFor();
   const [{ metres }, frames] = [await state(page), await total(page, "frames")];
   assert.ok(metres > 10, `${metres} m of lines`);
+  assert.deepEqual(await page.evaluate(() => window.lanemap.sessionsOnScreen()), [], "the shared map is of no drive alone");
   await page.waitForFunction(
     ([metres, frames]) => window.lanemap.state.metres > metres + 50
       && Number(document.querySelector('[data-total="frames"]').textContent) > frames,
@@ -111,6 +112,7 @@ test("a session is chosen, followed and left by keyboard alone, and the address 
   await page.keyboard.press("Enter");
   assert.equal(new URL(page.url()).searchParams.get("session"), id);
   assert.equal(await page.locator(`#sessions button[aria-current="true"] code`).textContent(), id);
+  await page.waitForFunction((id) => window.lanemap.sessionsOnScreen().join() === id, id, { timeout: PATIENCE_MS });
   await page.keyboard.press("f");
   assert.equal(await page.locator("#follow").getAttribute("aria-pressed"), "true");
   await page.evaluate(() => window.lanemap.settled());

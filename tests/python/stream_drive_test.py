@@ -63,7 +63,7 @@ class StreamDrive(Served):
         printed = self.stream()
         self.assertIn("Summary(acked=200, refused=0, reconnections=0)", printed)
 
-        lanes = get(f"http://{self.address}/collections/lanes/items")["features"]
+        lanes = get(f"http://{self.address}/collections/drives/items")["features"]
         self.assertEqual(len(lanes), 2)
         for lane in lanes:
             for longitude, latitude, *_ in lane["geometry"]["coordinates"]:

@@ -70,6 +70,22 @@ fn frames_of(sessions: &[Value]) -> Vec<u64> {
     sessions.iter().map(|session| session["frames"].as_u64().unwrap()).collect()
 }
 
+/// Asks for the lines of the shared map until there are some.
+async fn shared_lanes(base: &str) -> Value {
+    let mut ticks = interval(Duration::from_millis(50));
+    let asking = async {
+        loop {
+            ticks.tick().await;
+            let answer = http::get(format!("{base}/collections/lanes/items")).await.unwrap();
+            let lanes: Value = answer.json().await.unwrap();
+            if lanes["features"].as_array().is_some_and(|lanes| !lanes.is_empty()) {
+                return lanes;
+            }
+        }
+    };
+    timeout(PATIENCE, asking).await.expect("the fleet shares a map")
+}
+
 /// Asks for the sessions until `enough` says so.
 async fn sessions_until(base: &str, enough: impl Fn(&[Value]) -> bool) -> Vec<Value> {
     let mut ticks = interval(Duration::from_millis(50));
@@ -101,7 +117,7 @@ async fn the_demo_answers_at_its_address_its_maps_grow_on_the_earth_and_ctrl_c_e
     let has_lanes = |all: &[Value]| all.iter().any(|session| session["lanes"].as_u64() > Some(0));
     sessions_until(&base, has_lanes).await;
 
-    let lanes: Value = http::get(format!("{base}/collections/lanes/items")).await.unwrap().json().await.unwrap();
+    let lanes = shared_lanes(&base).await;
     let place = &lanes["features"][0]["geometry"]["coordinates"][0];
     assert!((place[0].as_f64().unwrap() - 7.68).abs() < 0.05, "in Turin: {place}");
     assert!((place[1].as_f64().unwrap() - 45.07).abs() < 0.05, "in Turin: {place}");

@@ -231,7 +231,7 @@ async fn an_unchanged_map_is_answered_304_until_a_frame_comes() {
     let id = service.drive("first", true).await;
     let lanes = format!("/sessions/{id}/lanes.geojson");
     for path in
-        ["/sessions", lanes.as_str(), &format!("/sessions/{id}/lanes.pb"), "/collections/lanes/items", "/viewer"]
+        ["/sessions", lanes.as_str(), &format!("/sessions/{id}/lanes.pb"), "/collections/drives/items", "/viewer"]
     {
         let first = service.get(path).await;
         let tag = first.headers()[header::ETAG].to_str().unwrap().to_owned();
@@ -281,9 +281,11 @@ async fn a_parameter_that_is_malformed_or_not_known_is_refused_by_its_name() {
         ("bbbox=1,2,3,4", "bbbox"),
         ("limit=1&limit=2", "limit"),
     ] {
-        let path = format!("/collections/lanes/items?{query}");
-        let problem = service.problem(&path, StatusCode::BAD_REQUEST).await;
-        assert_eq!(problem["parameter"], parameter, "{path}: {problem}");
+        for collection in ["lanes", "drives"] {
+            let path = format!("/collections/{collection}/items?{query}");
+            let problem = service.problem(&path, StatusCode::BAD_REQUEST).await;
+            assert_eq!(problem["parameter"], parameter, "{path}: {problem}");
+        }
     }
     let crs = service.problem(&format!("/sessions/{id}/lanes.geojson?crs=utm"), StatusCode::BAD_REQUEST).await;
     assert_eq!(crs["parameter"], "crs");
@@ -297,7 +299,7 @@ async fn pages_that_are_linked_by_next_hold_every_lane_of_the_georeferenced_sess
     let without_gnss = service.drive("b", false).await;
     service.drive("c", true).await;
 
-    let mut path = "/collections/lanes/items?limit=1&bbox=11.5,48.1,11.7,48.2".to_owned();
+    let mut path = "/collections/drives/items?limit=1&bbox=11.5,48.1,11.7,48.2".to_owned();
     let mut seen = Vec::new();
     loop {
         let page = service.features(&path).await;
@@ -312,9 +314,9 @@ async fn pages_that_are_linked_by_next_hold_every_lane_of_the_georeferenced_sess
         path = next["href"].as_str().unwrap().to_owned();
     }
     assert_eq!(seen.iter().collect::<BTreeSet<_>>().len(), seen.len(), "no lane comes twice");
-    let whole = service.features("/collections/lanes/items").await;
+    let whole = service.features("/collections/drives/items").await;
     assert_eq!(seen, whole.features.iter().map(|feature| format!("{:?}", feature.id)).collect::<Vec<_>>());
-    assert!(service.features("/collections/lanes/items?bbox=0,0,1,1").await.features.is_empty());
+    assert!(service.features("/collections/drives/items?bbox=0,0,1,1").await.features.is_empty());
 }
 
 #[tokio::test]
@@ -367,6 +369,8 @@ async fn no_answer_names_the_fleet_the_vehicle_or_the_drive() {
         &format!("/sessions/{id}/lanes.geojson?crs=local"),
         &format!("/sessions/{id}/lanes.pb"),
         "/collections/lanes/items",
+        "/collections/drives/items",
+        "/cells",
         "/metrics",
         "/healthz",
         "/readyz",

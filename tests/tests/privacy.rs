@@ -264,6 +264,8 @@ async fn all_answers(url: &str, session: &str) -> Vec<(String, String)> {
         format!("/sessions/{session}/lanes.geojson?crs=local"),
         format!("/sessions/{session}/lanes.pb"),
         "/collections/lanes/items".to_owned(),
+        "/collections/drives/items".to_owned(),
+        "/cells".to_owned(),
         "/collections/lanes/items?bbox=1,2".to_owned(),
         "/viewer".to_owned(),
         "/healthz".to_owned(),

@@ -1,4 +1,5 @@
-// The feed: which sessions there are, and the lanes of those that changed. Polls, and fetches nothing twice.
+// The feed: which sessions there are, the cells of the shared map, and the lanes of those that changed. Polls, and fetches
+// nothing twice.
 
 const PERIOD_MS = 1000;
 const LONGEST_PAUSE_MS = 15000;
@@ -6,7 +7,9 @@ const LONGEST_PAUSE_MS = 15000;
 export class Feed {
   /** The sessions as the server last listed them, each with its number in the order in which they began. */
   sessions = [];
-  /** What of each session was fetched last: its version and frame of reference. */
+  /** The cells of the shared map as the server last listed them. */
+  cells = [];
+  /** What of each session and each cell was fetched last: its version and frame of reference. */
   #fetched = new Map();
   /** The entity tag of each address, for conditional requests. */
   #tags = new Map();
@@ -15,8 +18,8 @@ export class Feed {
 
   /**
    * `on.sessions(list, total)` is called when the list changed, `on.lanes(session, collection)` when a session's lanes did,
-   * `on.gone(id)` when a session left the list, `on.connection(state)` with "connected" or "lost";
-   * `on.wants(session)` says whether its lanes are drawn at all.
+   * `on.cell(cell, collection)` when a cell's did, `on.gone(id)` when a session left the list, `on.connection(state)` with
+   * "connected" or "lost"; `on.wants(session)` and `on.wantsCell(cell)` say whether its lanes are drawn at all.
    */
   constructor(on) {
     this.#on = on;
@@ -62,10 +65,17 @@ export class Feed {
       if (lanes) this.#on.lanes(session, lanes);
       this.#fetched.set(session.id, state);
     }
+    this.cells = (await this.#fetchChanged("cells"))?.cells ?? this.cells;
+    for (const cell of this.cells) {
+      if (this.#fetched.get(cell.id) === cell.version || !this.#on.wantsCell(cell)) continue;
+      const lanes = await this.#fetchChanged(`cells/${cell.id}/lanes.geojson`);
+      if (lanes) this.#on.cell(cell, lanes);
+      this.#fetched.set(cell.id, cell.version);
+    }
   }
 
   #forgetGone() {
-    const alive = new Set(this.sessions.map((session) => session.id));
+    const alive = new Set([...this.sessions, ...this.cells].map(({ id }) => id));
     for (const id of [...this.#fetched.keys()].filter((id) => !alive.has(id))) {
       this.#fetched.delete(id);
       for (const georeferenced of [true, false]) this.#tags.delete(lanesOf(id, georeferenced));
@@ -80,7 +90,7 @@ export class Feed {
     if (response.status === 304) return undefined;
     if (!response.ok) {
       this.#tags.delete(path);
-      if (path === "sessions") throw new Error(`${path} answers ${response.status}`);
+      if (path === "sessions" || path === "cells") throw new Error(`${path} answers ${response.status}`);
       return undefined;
     }
     const body = await response.json();

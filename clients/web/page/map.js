@@ -17,7 +17,7 @@ const REACH_PX = 6;
 export class LaneMap {
   /** Resolves once the style is drawn. */
   ready;
-  /** What is drawn, by session: the keys of its lines and their length together. */
+  /** What is drawn, by session and by cell: the keys of its lines and their length together. */
   #drawn = new Map();
   #chosen;
   #local = false;
@@ -69,10 +69,23 @@ export class LaneMap {
       geometry: session.georeferenced ? geometry : placeLocalGeometry(geometry),
       properties: { ...properties, key: String(id), local: !session.georeferenced },
     }));
+    this.#show(session.id, features);
+  }
+
+  /** Draws a cell of the shared map in place of what was drawn of it before. */
+  showCell(cell, collection) {
+    this.#show(cell.id, collection.features.map(({ geometry, properties, id }) => ({
+      type: "Feature",
+      geometry,
+      properties: { ...properties, sigma_m: properties.lateral_sigma_m, key: String(id), shared: true, local: false },
+    })));
+  }
+
+  #show(id, features) {
     const keys = new Set(features.map((feature) => feature.properties.key));
-    const remove = (this.#drawn.get(session.id)?.keys ?? []).filter((key) => !keys.has(key));
+    const remove = (this.#drawn.get(id)?.keys ?? []).filter((key) => !keys.has(key));
     const metres = features.reduce((total, { geometry }) => total + lengthOf(geometry), 0);
-    this.#drawn.set(session.id, { keys: [...keys], metres });
+    this.#drawn.set(id, { keys: [...keys], metres });
     this.#map.getSource("lanes").updateData({ remove, add: features });
   }
 
@@ -97,7 +110,10 @@ export class LaneMap {
     this.#map.getSource("vehicles").setData({ type: "FeatureCollection", features });
   }
 
-  /** Marks the chosen session; a `local` one is drawn alone, for it shares no frame with the others. */
+  /**
+   * Draws what the chosen session alone has seen in place of the shared map, which is drawn where none is chosen; of a
+   * `local` one the vehicle, too, is drawn alone, for it shares no frame with the others.
+   */
   choose(id, local) {
     if (this.#chosen === id && this.#local === local) return;
     [this.#chosen, this.#local] = [id, local];
@@ -154,7 +170,7 @@ export class LaneMap {
 
   /** The sessions that have a line on the screen. */
   sessionsOnScreen() {
-    return [...new Set(this.#onScreen().map((feature) => feature.properties.session))].sort();
+    return [...new Set(this.#onScreen().map((feature) => feature.properties.session).filter(Boolean))].sort();
   }
 
   /** A pixel on some line that no panel covers; waits for the map to stand still. */
@@ -185,11 +201,12 @@ export class LaneMap {
   }
 
   #layers(colours) {
-    const shown = this.#local ? ["==", ["get", "session"], this.#chosen] : ["!", ["get", "local"]];
+    const ofChosen = ["==", ["get", "session"], this.#chosen ?? ""];
+    const shown = this.#chosen === undefined ? ["==", ["get", "shared"], true] : ofChosen;
     return [
       ...gridLayers(colours),
       ...laneLayers(colours, this.#latitude, shown, this.#chosen ?? ""),
-      ...vehicleLayers(shown),
+      ...vehicleLayers(this.#local ? ofChosen : ["!", ["get", "local"]]),
     ];
   }
 
@@ -222,14 +239,15 @@ export class LaneMap {
     const properties = this.#lineAt(point)?.properties;
     if (!properties) return;
     const figures = {
-      session: properties.session,
+      ...(properties.shared ? { drives: properties.drives, cell: properties.cell } : { session: properties.session }),
       existence: `${Math.round(properties.existence * 100)} %`,
       "lateral sigma": `${Math.round(properties.sigma_m * 100)} cm`,
       observations: properties.observations,
       "last seen": properties.last_seen.replace("T", " ").slice(0, 19),
     };
     const title = document.createElement("h3");
-    title.textContent = `Lane ${properties.lane}: ${properties.category.replaceAll("_", " ")}`;
+    const name = properties.shared ? "Line" : `Lane ${properties.lane}`;
+    title.textContent = `${name}: ${properties.category.replaceAll("_", " ")}`;
     const table = document.createElement("table");
     for (const [name, value] of Object.entries(figures)) {
       const row = table.insertRow();

@@ -1,4 +1,4 @@
-// The viewer: lanes as they grow, and the vehicles that find them.
+// The viewer: the shared map as it grows, the vehicles that find it, and what each of them alone has seen.
 
 import { Feed } from "./feed.js";
 import { Panel } from "./panel.js";
@@ -8,9 +8,11 @@ const panel = new Panel({ choose, overview: () => choose(undefined), follow: tog
 const feed = new Feed({
   sessions: showSessions,
   lanes: (session, collection) => map?.showLanes(session, collection),
+  cell: (cell, collection) => map?.showCell(cell, collection),
   gone: (id) => map?.forget(id),
   connection: (state) => panel.connection(state),
-  wants: (session) => (session.georeferenced || session.id === chosen) && (map?.sees(session) ?? false),
+  wants: (session) => session.id === chosen && (map?.sees(session) ?? false),
+  wantsCell: (cell) => map?.sees({ ...cell, georeferenced: true }) ?? false,
 });
 
 let chosen = new URLSearchParams(location.search).get("session") ?? undefined;

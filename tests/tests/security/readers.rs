@@ -13,7 +13,14 @@ async fn maps_and_metrics_are_for_readers_and_health_is_for_all() {
     let service = Secured::start(|config| config).await;
     let reader = service.issuer.token(json!({ "scope": "read" }));
     let vehicle = car(&service.issuer, "car-1");
-    for path in ["/sessions", "/collections/lanes/items", "/metrics", "/sessions/0123456789abcdef/lanes.pb"] {
+    for path in [
+        "/sessions",
+        "/collections/lanes/items",
+        "/cells",
+        "/splines/14/0/0",
+        "/metrics",
+        "/sessions/0123456789abcdef/lanes.pb",
+    ] {
         let refused = service.get(path, None).await;
         assert_eq!(refused.status(), StatusCode::UNAUTHORIZED, "{path}");
         assert_eq!(refused.headers()[header::WWW_AUTHENTICATE], "Bearer realm=\"lanemap\"");
@@ -35,7 +42,7 @@ async fn maps_and_metrics_are_for_readers_and_health_is_for_all() {
         assert!(challenge.contains("insufficient_scope") && challenge.contains("scope=\"read\""), "{challenge}");
         assert_eq!(refused.json::<Value>().await.unwrap()["type"], "urn:lanemap:problem:not-permitted");
     }
-    for path in ["/sessions", "/metrics", "/collections/lanes/items"] {
+    for path in ["/sessions", "/metrics", "/collections/lanes/items", "/cells", "/splines/14/0/0"] {
         assert_eq!(service.get(path, Some(&reader)).await.status(), StatusCode::OK, "{path}");
     }
     for path in ["/healthz", "/readyz", "/viewer"] {

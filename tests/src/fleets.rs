@@ -1,0 +1,148 @@
+//! Drives of many vehicles along one road, each with a receiver of its own, and the shared map that comes of them.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use lanemap_core::{fleet::CellId, geometry::georeference::Georeference};
+use lanemap_proto::{
+    encode,
+    v1::{self, ingest_service_client::IngestServiceClient},
+};
+use lanemap_server::{RunningServer, fuse::SharedMap};
+use lanemap_simulator::{
+    FleetScenario, Seed,
+    fleet::{FleetRoutes, ReceiverModel},
+};
+use prost::Message;
+use serde_json::Value;
+use tokio::time::{interval, timeout};
+
+use crate::http;
+
+/// Longest wait for what takes a second or two on an idle machine.
+pub const PATIENCE: Duration = Duration::from_mins(2);
+/// Fleet of all these drives.
+pub const FLEET: &str = "test-fleet";
+
+/// One drive of the fleet, as the wire has it.
+#[derive(Clone, Debug)]
+pub struct WireDrive {
+    /// Number within the fleet; the vehicle is named after it.
+    pub number: u32,
+    /// What its session starts with.
+    pub start: v1::SessionStart,
+    /// Its frames.
+    pub frames: Vec<v1::Frame>,
+}
+
+/// `count` drives, a day apart, of `length_m` along one straight road, each with a GNSS bias of its own. With `on_border`
+/// the border of two cells runs across the middle of the way.
+#[must_use]
+pub fn along_a_road(seed: u64, count: u32, length_m: f64, on_border: bool) -> Vec<WireDrive> {
+    let mut scenario = FleetScenario {
+        drives: count,
+        routes: FleetRoutes::Shared { length_m, both_directions: false },
+        receiver: ReceiverModel { bias_sigma_m: 1.0, ..ReceiverModel::default() },
+        ..FleetScenario::straight_road()
+    };
+    // Within a cell, or half way over its border.
+    let fleet = scenario.fleet(Seed(seed));
+    let drive = fleet.drive(0);
+    let states = drive.states();
+    let (first, last) = (states[0].world_from_vehicle, states[states.len() - 1].world_from_vehicle);
+    let middle = first.translation.vector.lerp(&last.translation.vector, 0.5);
+    let way = last.translation.vector - first.translation.vector;
+    let place = Georeference::to_wgs84(fleet.georeference(), &middle.into());
+    let cell = CellId::containing(&place).unwrap();
+    let (bounds, centre) = (cell.bounds(), cell.anchor().place());
+    let eastward = way.x.abs() > way.y.abs();
+    let wanted = match (on_border, eastward) {
+        (false, _) => (centre.longitude_deg, centre.latitude_deg),
+        (true, true) => (bounds.east, centre.latitude_deg),
+        (true, false) => (centre.longitude_deg, bounds.north),
+    };
+    scenario.anchor.longitude_deg += wanted.0 - place.longitude_deg;
+    scenario.anchor.latitude_deg += wanted.1 - place.latitude_deg;
+    drop(drive);
+
+    let fleet = scenario.fleet(Seed(seed));
+    let wire = fleet.drives().map(|drive| WireDrive {
+        number: drive.number(),
+        start: v1::SessionStart {
+            fleet_id: FLEET.to_owned(),
+            vehicle_id: format!("vehicle-{}", drive.number()),
+            drive_id: "a-drive".to_owned(),
+            preset: v1::MapperPreset::Default.into(),
+            sensor: Some(encode::sensor(&drive.sensor())),
+            wants_local_map: false,
+        },
+        frames: drive.frames().map(|frame| encode::frame(&frame)).collect(),
+    });
+    wire.collect()
+}
+
+impl WireDrive {
+    /// Uploads the first frames, or all; gives the session's id.
+    pub async fn upload(&self, url: &str, frames: usize, end: bool) -> String {
+        let mut client = IngestServiceClient::connect(url.to_owned()).await.unwrap();
+        let frames = self.frames[..frames.min(self.frames.len())].to_vec();
+        let request = v1::UploadObservationsRequest { start: Some(self.start.clone()), frames, end };
+        let answer = client.upload_observations(request).await.unwrap().into_inner();
+        assert_eq!(answer.refusals, []);
+        answer.accepted.unwrap().session_id
+    }
+
+    /// Uploads the whole drive and ends it; gives the session's id.
+    pub async fn upload_whole(&self, url: &str) -> String {
+        self.upload(url, self.frames.len(), true).await
+    }
+}
+
+/// Waits until all that drives have said is in the shared map, and what is told of it is as it should be.
+pub async fn settled(server: &RunningServer) {
+    settled_where(server.map(), |_| true).await;
+}
+
+/// The same, and until `holds` says so.
+pub async fn settled_where(map: &SharedMap, holds: impl Fn(&SharedMap) -> bool) {
+    let mut publications = map.publications();
+    let settling = async {
+        while !(map.is_settled() && holds(map)) {
+            publications.changed().await.unwrap();
+        }
+    };
+    timeout(PATIENCE, settling).await.expect("the map settles");
+}
+
+/// Asks a server for its cells until all that drives have said is in them, and `holds` says so of the list.
+pub async fn cells_until(url: &str, holds: impl Fn(&[Value]) -> bool) -> Vec<Value> {
+    let mut ticks = interval(Duration::from_millis(50));
+    let asking = async {
+        loop {
+            ticks.tick().await;
+            let answer: Value = http::get(format!("{url}/cells")).await.unwrap().json().await.unwrap();
+            let cells = answer["cells"].as_array().unwrap().clone();
+            if answer["settled"] == true && holds(&cells) {
+                return cells;
+            }
+        }
+    };
+    timeout(PATIENCE, asking).await.expect("the map settles")
+}
+
+/// The bytes of every cell, by its name.
+pub async fn cell_bytes(url: &str) -> BTreeMap<String, Vec<u8>> {
+    let list: Value = http::get(format!("{url}/cells")).await.unwrap().json().await.unwrap();
+    let mut cells = BTreeMap::new();
+    for cell in list["cells"].as_array().unwrap() {
+        let id = cell["id"].as_str().unwrap();
+        let answer = http::get(format!("{url}/cells/{id}/lanes.pb")).await.unwrap();
+        cells.insert(id.to_owned(), answer.error_for_status().unwrap().bytes().await.unwrap().to_vec());
+    }
+    cells
+}
+
+/// Every cell as it is served.
+pub async fn cell_maps(url: &str) -> Vec<v1::CellMap> {
+    let cells = cell_bytes(url).await;
+    cells.values().map(|bytes| v1::CellMap::decode(bytes.as_slice()).unwrap()).collect()
+}

@@ -95,7 +95,7 @@ fn way_within(trajectory: &[TrajectoryPoint], along: &[Vec<Nearby>], cell: CellI
             way.push(TrajectoryPoint {
                 motion_variance_m2: std::mem::take(&mut motion_m2),
                 turn_variance_rad2: std::mem::take(&mut turn_rad2),
-                ..*point
+                ..point.clone()
             });
         }
     }
@@ -159,6 +159,7 @@ mod tests {
             motion_variance_m2: 1.0,
             turn_variance_rad2: 2.0,
             fix: None,
+            hidden: vec![],
         };
         let control_points =
             way.iter().map(|x| ControlPoint { position: Point3::new(*x, 2.0, 0.0), covariance: Matrix3::identity() });

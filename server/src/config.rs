@@ -202,7 +202,7 @@ impl Default for ServerConfig {
             fuse_threads: 1,
             fuse_interval_ms: 500,
             fuse_cpu_share: 0.5,
-            max_contributions_per_cell: 64,
+            max_contributions_per_cell: 256,
             cell_versions_kept_s: 3600,
             max_cached_cell_bytes: 128 * 1024 * 1024,
             keep_alive_s: 20,

@@ -10,6 +10,7 @@
 //! ([`queue`]), and rest in between, so that they take no more than a share of a core. What a cell is fused from is its
 //! fingerprint: it is kept, and a start fuses nothing again that has not changed.
 
+mod bases;
 pub(crate) mod border;
 mod cell_record;
 pub(crate) mod offer;
@@ -40,6 +41,7 @@ use crate::{
     journal::{JournalError, cells::CellStore},
     session::{MapVersion, SessionId},
 };
+use bases::Bases;
 use cell_record::fingerprint;
 use queue::Queue;
 use worker::Worker;
@@ -77,6 +79,7 @@ struct Shared {
     settings: FuseSettings,
     map: SharedMap,
     queue: Mutex<Queue>,
+    bases: Bases,
     /// Told when there is more in the queue, or nothing more will come.
     woken: Condvar,
     stopping: AtomicBool,
@@ -120,6 +123,7 @@ impl Fuser {
             settings,
             map,
             queue: Mutex::new(queue),
+            bases: Bases::new(),
             woken: Condvar::new(),
             stopping: AtomicBool::new(false),
             done: watch::Sender::default(),
@@ -205,9 +209,8 @@ impl FuseThreads {
         self.fuser.shared.stopping.store(true, Ordering::Relaxed);
         self.fuser.shared.woken.notify_all();
         let join = move || self.threads.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
-        match tokio::task::spawn_blocking(join).await {
-            Ok(0) => {}
-            _ => tracing::error!("a fusing thread has failed"),
+        if !matches!(tokio::task::spawn_blocking(join).await, Ok(0)) {
+            tracing::error!("a fusing thread has failed");
         }
     }
 }

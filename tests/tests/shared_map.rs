@@ -49,10 +49,6 @@ async fn counter(url: &str, name: &str) -> u64 {
     line.rsplit(' ').next().unwrap().parse().unwrap()
 }
 
-fn length_m(lane: &v1::FusedLane) -> f64 {
-    positions(lane).windows(2).map(|pair| nalgebra::distance(&pair[0], &pair[1])).sum()
-}
-
 /// Shortest distance between control points of two lanes, in plan, metres.
 fn apart_m(a: &v1::FusedLane, b: &v1::FusedLane) -> f64 {
     let (a, b) = (positions(a), positions(b));
@@ -130,7 +126,9 @@ async fn any_order_of_upload_and_any_duplication_gives_the_same_map() {
         }
         settled(&server).await;
         let mut map = cell_maps(&server.url()).await;
-        map.iter_mut().for_each(|cell| cell.version = 0);
+        for cell in &mut map {
+            cell.version = 0;
+        }
         maps.push(map);
         server.shutdown().await;
     }

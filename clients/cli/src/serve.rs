@@ -86,8 +86,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "FILE")]
     zenoh_vehicles_file: Option<PathBuf>,
     /// Vehicles that may connect to the router with a password: fleet/vehicle:password on each line; each may use its
-    /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default:
-    /// none]
+    /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default: none]
     #[arg(long, value_name = "FILE")]
     zenoh_passwords_file: Option<PathBuf>,
     /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts
@@ -100,8 +99,7 @@ pub struct ServeArgs {
     /// File of the password of --zenoh-user [env: LANEMAP_ZENOH_PASSWORD_FILE] [default: none]
     #[arg(long, value_name = "FILE")]
     zenoh_password_file: Option<PathBuf>,
-    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as lanemap zenoh-access has
-    /// it
+    /// Take it that the router of a zenoh client lets each vehicle use its own keys only, as lanemap zenoh-access has it
     /// [env: LANEMAP_ZENOH_TRUST_ROUTER] [default: false]
     #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     zenoh_trust_router: Option<bool>,
@@ -158,8 +156,7 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_WAITING_COMMITS] [default: 4096]
     #[arg(long, value_name = "N")]
     max_waiting_commits: Option<usize>,
-    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go
-    /// on
+    /// Room on the disk below which frames are refused, bytes; 0 leaves nothing in reserve. The store needs some to go on
     /// [env: LANEMAP_MIN_FREE_DISK_BYTES] [default: 536870912]
     #[arg(long, value_name = "BYTES")]
     min_free_disk_bytes: Option<u64>,
@@ -182,16 +179,16 @@ pub struct ServeArgs {
     /// Threads that fuse the shared map, 0 to 64; 0: it stands still [env: LANEMAP_FUSE_THREADS] [default: 1]
     #[arg(long, value_name = "N")]
     fuse_threads: Option<usize>,
-    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once [env:
-    /// LANEMAP_FUSE_INTERVAL_MS] [default: 500]
+    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once
+    /// [env: LANEMAP_FUSE_INTERVAL_MS] [default: 500]
     #[arg(long, value_name = "MS")]
     fuse_interval_ms: Option<u64>,
-    /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work [env:
-    /// LANEMAP_FUSE_CPU_SHARE] [default: 0.5]
+    /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work
+    /// [env: LANEMAP_FUSE_CPU_SHARE] [default: 0.5]
     #[arg(long, value_name = "SHARE")]
     fuse_cpu_share: Option<f64>,
-    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped [env:
-    /// LANEMAP_MAX_CONTRIBUTIONS_PER_CELL] [default: 64]
+    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped
+    /// [env: LANEMAP_MAX_CONTRIBUTIONS_PER_CELL] [default: 256]
     #[arg(long, value_name = "N")]
     max_contributions_per_cell: Option<usize>,
     /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;
@@ -199,8 +196,8 @@ pub struct ServeArgs {
     /// [env: LANEMAP_CELL_VERSIONS_KEPT_S] [default: 3600]
     #[arg(long, value_name = "S")]
     cell_versions_kept_s: Option<u64>,
-    /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for [env:
-    /// LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
+    /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for
+    /// [env: LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
     max_cached_cell_bytes: Option<usize>,
     /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]

@@ -3,7 +3,10 @@
 //! Geometry is rounded to millimetres, so that equal maps have equal bytes and what moved by less is no change.
 //! `snapshot(v) + changes(v, w) = snapshot(w)`, byte for byte: lanes are encoded whole, in the order of their names.
 
-use std::{cmp::Ordering, collections::BTreeMap};
+use std::{
+    cmp::Ordering,
+    collections::{BTreeMap, BTreeSet},
+};
 
 use lanemap_core::{
     LaneId, TimestampNs,
@@ -59,12 +62,12 @@ pub(crate) fn lanes(pieces: &[JoinedPiece]) -> Vec<v1::FusedLane> {
 #[must_use]
 pub fn changes(before: &v1::CellMap, after: &v1::CellMap) -> v1::CellChanges {
     let known: BTreeMap<Key, &v1::FusedLane> = before.lanes.iter().map(|lane| (key(lane), lane)).collect();
-    let kept: BTreeMap<Key, ()> = after.lanes.iter().map(|lane| (key(lane), ())).collect();
+    let kept: BTreeSet<Key> = after.lanes.iter().map(key).collect();
     // Compared as bytes: NaN never occurs, but -0.0 and 0.0 would pass for equal.
     let is_new = |lane: &&v1::FusedLane| {
         known.get(&key(lane)).is_none_or(|before| before.encode_to_vec() != lane.encode_to_vec())
     };
-    let removed = known.keys().filter(|key| !kept.contains_key(*key)).map(|(id, part)| v1::LaneName {
+    let removed = known.keys().filter(|key| !kept.contains(*key)).map(|(id, part)| v1::LaneName {
         cell: after.cell.clone(),
         id: id.clone(),
         part: *part,

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
-use lanemap_core::fleet::{CellId, Contribution, DriveId, FleetParams, FusedMap, fuse};
+use lanemap_core::fleet::{CellId, DriveId, FleetParams, FusedMap};
 use lanemap_proto::v1;
 use prost::Message;
 
@@ -223,11 +223,8 @@ impl Worker {
 
     fn fuse_from(&self, cell: CellId, facts: &Facts) -> Result<Fused, JournalError> {
         let started = Instant::now();
-        let contributions: Vec<Contribution> = facts
-            .keys()
-            .filter_map(|session| self.store.contribution(cell, *session).transpose())
-            .collect::<Result<_, _>>()?;
-        let map = fuse(&contributions, &cell.anchor(), &FleetParams::default());
+        let read = |session| self.store.contribution(cell, session);
+        let map = self.fuser.shared.bases.fuse(cell, facts, &FleetParams::default(), read)?;
         let (pieces, crossings) = border::cut(cell, &map.lanes);
         let took = started.elapsed();
         metrics::histogram!(telemetry::FUSE_SECONDS).record(took.as_secs_f64());
@@ -272,7 +269,7 @@ impl CellRecord {
     fn tell(&mut self, fused: &Fused, facts: &Facts) {
         self.fused_at_ms = now_ms();
         self.fused_in_ms = u64::try_from(fused.took.as_millis()).unwrap_or(u64::MAX);
-        self.drives = u32::try_from(fused.map.drives.len()).unwrap_or(u32::MAX);
+        self.drives = u32::try_from(facts.len()).unwrap_or(u32::MAX);
         let apart: Vec<DriveId> =
             fused.map.drives.iter().filter(|drive| drive.correction.is_none()).map(|drive| drive.drive).collect();
         let is_apart = |fact: &ContributionFact| apart.contains(&fact.drive);

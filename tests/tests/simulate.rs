@@ -72,6 +72,40 @@ fn gnss_poses_are_off_by_the_bias_of_their_drive() {
 }
 
 #[test]
+fn a_fleets_city_is_written_with_its_truth_before_and_after_and_what_changed() {
+    let options = ["--roads", "city", "--drives", "3", "--seed", "2", "--changes", "2", "--zones", "1"];
+    let folder = simulated(&options);
+    assert_eq!(files(folder.path()), files(simulated(&options).path()));
+    let json = |file: &str| -> Value { serde_json::from_slice(&fs::read(folder.path().join(file)).unwrap()).unwrap() };
+    let (index, changes) = (json("index.json"), json("changes.geojson"));
+    let drives = Drives::list(folder.path(), &[]).unwrap();
+    for (entry, drive) in index["drives"].as_array().unwrap().iter().zip(&drives) {
+        assert_eq!((&entry["name"], &entry["frames"]), (&Value::from(drive.name()), &Value::from(drive.len())));
+        assert!(drive.frames().all(|frame| frame.unwrap().annotation.world_from_vehicle_gnss.is_some()));
+    }
+    assert!(index["anchor"]["latitude_deg"].is_f64());
+    let kinds: std::collections::BTreeSet<_> = changes["features"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|change| change["properties"]["change"].to_string())
+        .collect();
+    assert_eq!(kinds.len(), 4, "{kinds:?}");
+    assert_ne!(json("network.geojson"), json("network-before.geojson"));
+}
+
+#[test]
+fn options_of_fleets_are_refused_where_there_is_no_fleet() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = simulate(folder.path(), &["--roads", "town", "--traffic-per-km", "5"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("need --roads city"));
+    let output = simulate(folder.path(), &["--roads", "city", "--both-directions"]);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("needs --shared-route"));
+    assert!(files(folder.path()).is_empty());
+}
+
+#[test]
 fn a_simulation_too_large_for_a_disk_is_refused_with_the_limit() {
     let folder = tempfile::tempdir().unwrap();
     let output = simulate(folder.path(), &["--drives", "1000", "--length-km", "50"]);

@@ -7,17 +7,11 @@ use std::{net::SocketAddr, path::PathBuf, process::ExitCode, time::Duration};
 use anyhow::Context;
 use clap::Args;
 use lanemap_client::IngestClient;
-use lanemap_core::{
-    Pose,
-    geometry::georeference::{Anchor, Georeference, Wgs84},
-};
 use lanemap_server::{ConfigOverrides, Server, ServerConfig};
-use lanemap_simulator::{Scenario, road::NetworkPlan};
+use lanemap_simulator::{FleetScenario, Seed, fleet::FleetRoutes};
 
 use crate::signal;
 
-/// Where the simulated town lies: Turin, whose streets are a grid as well.
-const TURIN: Wgs84 = Wgs84 { latitude_deg: 45.0628, longitude_deg: 7.6688, height_m: 239.0 };
 /// Time that vehicles get to end their streams before the server does.
 const FLEET_GRACE: Duration = Duration::from_secs(3);
 
@@ -55,7 +49,7 @@ pub async fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
         .await
         .context("the demo does not start; --listen and --data-dir choose another address and another folder")?;
     let client = IngestClient::connect(server.url()).await.context("the demo's own server cannot be reached")?;
-    let fleet = fleet::Fleet::start(args.vehicles, &town(args), turin(), &client);
+    let fleet = fleet::Fleet::start(args.vehicles, town(args), &client);
     let url = server.url();
     println!("viewer  {url}/viewer\nlanes   {url}/collections/lanes/items\ngRPC    {url}");
     println!("{} vehicles are driving; Ctrl-C stops", args.vehicles);
@@ -72,15 +66,8 @@ fn drive_km(text: &str) -> Result<f64, String> {
     }
 }
 
-fn town(args: &DemoArgs) -> Scenario {
-    Scenario {
-        network: NetworkPlan::Grid { columns: 5, rows: 5, spacing_m: 420.0 },
-        length_m: args.drive_km * 1e3,
-        drives: 0,
-        ..Scenario::town(args.seed)
-    }
-}
-
-fn turin() -> Georeference {
-    Georeference { anchor: Anchor::new(TURIN), enu_from_map: Pose::identity() }
+/// A small town, in which the ways of the vehicles overlap.
+fn town(args: &DemoArgs) -> lanemap_simulator::Fleet {
+    let routes = FleetRoutes::Random { length_m: args.drive_km * 1e3 };
+    FleetScenario { routes, ..FleetScenario::small_town(args.vehicles) }.fleet(Seed(args.seed))
 }

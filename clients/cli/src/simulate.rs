@@ -1,11 +1,16 @@
 //! `lanemap simulate`: synthetic drives with their truth.
 
+mod fleet;
+
 use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
+use fleet::{FleetArgs, World, with_speeds};
 use lanemap_simulator::{
-    OdometryNoise, Scenario, Seed, drive::MotionModel, openlane::write_simulation, road::NetworkPlan,
+    FleetScenario, OdometryNoise, Scenario, Seed,
+    openlane::{write_fleet, write_simulation},
+    road::{Course, NetworkPlan},
 };
 
 /// Longest way of one simulation, km: about 15 GB of files.
@@ -41,6 +46,8 @@ pub struct SimulateArgs {
     /// Fastest cruise speed of a drive, m/s [default: 15 in a town, 22 on a long road]
     #[arg(long, value_name = "M/S", value_parser = positive)]
     max_speed_mps: Option<f64>,
+    #[command(flatten)]
+    fleet: FleetArgs,
 }
 
 /// Which road network.
@@ -50,6 +57,27 @@ enum Roads {
     Town,
     /// One long one-way road that never comes back to where it was
     LongRoad,
+    /// A fleet's city: streets, avenues, roundabouts, a motorway with ramps, traffic, GNSS canyons
+    City,
+    /// A fleet on one straight road of two lanes each way
+    Straight,
+    /// A fleet on one winding road of two lanes each way
+    Winding,
+    /// A fleet on a closed loop of 2 km
+    Loop,
+}
+
+impl Roads {
+    /// The world of a fleet; `None` where drives go by themselves.
+    fn world(self) -> Option<World> {
+        match self {
+            Self::Town | Self::LongRoad => None,
+            Self::City => Some(World::City),
+            Self::Straight => Some(World::Road(Course::Straight)),
+            Self::Winding => Some(World::Road(Course::Winding)),
+            Self::Loop => Some(World::Road(Course::Loop)),
+        }
+    }
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -63,9 +91,11 @@ fn not_negative(text: &str) -> Result<f64, String> {
 
 /// Simulates and writes.
 pub fn run(args: &SimulateArgs) -> anyhow::Result<ExitCode> {
-    let scenario = scenario(args)?;
-    let written = write_simulation(&args.out, &scenario)
-        .context("the simulation cannot be written; --out must name a folder that can be made")?;
+    let written = match args.roads.world() {
+        Some(world) => write_fleet(&args.out, &fleet_scenario(args, world)?.fleet(Seed(args.seed))),
+        None => write_simulation(&args.out, &scenario(args)?),
+    };
+    let written = written.context("the simulation cannot be written; --out must name a folder that can be made")?;
     println!(
         "{} drives, {} frames, {:.2} km, seed {} in {}",
         written.drives,
@@ -77,28 +107,35 @@ pub fn run(args: &SimulateArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn scenario(args: &SimulateArgs) -> anyhow::Result<Scenario> {
+fn fleet_scenario(args: &SimulateArgs, world: World) -> anyhow::Result<FleetScenario> {
+    let length_m = length_m(args)?;
+    let shared_route = args.shared_route || world != World::City;
+    let max_grade = args.max_grade_percent / 100.0;
+    let scenario = args.fleet.scenario(world, args.drives, length_m, shared_route, max_grade)?;
+    let motion = with_speeds(scenario.motion, args.min_speed_mps, args.max_speed_mps)?;
+    Ok(FleetScenario { motion, ..scenario })
+}
+
+/// Length of a drive, metres, where all drives together are not too long.
+fn length_m(args: &SimulateArgs) -> anyhow::Result<f64> {
     let total_km = args.length_km * f64::from(args.drives);
     if total_km > MAX_TOTAL_KM {
         bail!("{total_km} km in all are more than {MAX_TOTAL_KM}; lower --drives or --length-km, or simulate in parts");
     }
-    let length_m = args.length_km * 1e3;
-    let base = match args.roads {
-        Roads::Town => Scenario { network: town_for(length_m), ..Scenario::town(args.seed) },
-        Roads::LongRoad => Scenario::long_road(args.seed, length_m),
-    };
-    let motion = MotionModel {
-        min_speed_mps: args.min_speed_mps.unwrap_or(base.motion.min_speed_mps),
-        max_speed_mps: args.max_speed_mps.unwrap_or(base.motion.max_speed_mps),
-        ..base.motion
-    };
-    if motion.min_speed_mps > motion.max_speed_mps {
-        bail!(
-            "--min-speed-mps {} is above --max-speed-mps {}; give both, the lower first",
-            motion.min_speed_mps,
-            motion.max_speed_mps
-        );
+    Ok(args.length_km * 1e3)
+}
+
+fn scenario(args: &SimulateArgs) -> anyhow::Result<Scenario> {
+    if args.fleet.is_given() {
+        bail!("options of fleets need --roads city, straight, winding or loop");
     }
+    let length_m = length_m(args)?;
+    let base = if args.roads == Roads::LongRoad {
+        Scenario::long_road(args.seed, length_m)
+    } else {
+        Scenario { network: town_for(length_m), ..Scenario::town(args.seed) }
+    };
+    let motion = with_speeds(base.motion, args.min_speed_mps, args.max_speed_mps)?;
     Ok(Scenario {
         seed: Seed(args.seed),
         drives: args.drives,

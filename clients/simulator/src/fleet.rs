@@ -198,6 +198,12 @@ pub struct Fleet {
 }
 
 impl Fleet {
+    /// The seed that fixes everything.
+    #[must_use]
+    pub fn seed(&self) -> Seed {
+        self.seed
+    }
+
     /// What is simulated.
     #[must_use]
     pub fn scenario(&self) -> &FleetScenario {

@@ -11,9 +11,11 @@
 //! Poses are true: odometry noise is for the reader to add (`lanemap replay --pose-noise`). Points are rounded to a
 //! tenth of a millimetre, those of detections to a millimetre. The same simulation gives the same bytes.
 
+mod fleet;
+
 use std::{fs, path::Path};
 
-use lanemap_core::{Pose, evaluation::GroundFrame};
+use lanemap_core::{Detection, Pose, evaluation::GroundFrame};
 use lanemap_openlane::{
     AnnotatedLane, Annotation, DetectedLane, DetectionFile, OpenLaneError, write_annotation, write_result,
 };
@@ -23,7 +25,7 @@ use serde_json::{Value, json};
 
 use crate::{
     camera::Camera,
-    drive::motion::FRAME_RATE_HZ,
+    drive::{TrueState, motion::FRAME_RATE_HZ},
     random::{Purpose, SimRng},
     road::RoadNetwork,
     scenario::Scenario,
@@ -31,6 +33,8 @@ use crate::{
     truth_map::{TrueLine, TruthMap},
     view::LineView,
 };
+
+pub use fleet::write_fleet;
 
 /// Points of annotations and maps keep tenths of a millimetre.
 const TRUTH_STEPS_PER_M: f64 = 1e4;
@@ -95,7 +99,7 @@ fn write_drive(
         let annotation = annotation_of(&name, &scenario.camera, &frame);
         let time = frame.truth.time;
         write_annotation(root, &name, time, &annotation)?;
-        write_result(&results, &name, time, &annotation, &detections_of(&frame, &ground, rng))?;
+        write_result(&results, &name, time, &annotation, &detections_of(&frame.detections, &ground, rng))?;
         map.observe(&frame);
     }
     let lines = map.lines(network);
@@ -122,15 +126,19 @@ fn write_drive(
 /// The annotation of one frame: what is truly there.
 #[must_use]
 pub fn annotation_of(name: &str, camera: &Camera, frame: &SimulatedFrame) -> Annotation {
-    let stem = lanemap_openlane::timestamp_stem(frame.truth.time);
+    annotation(name, camera, &frame.truth, frame.gnss_world_from_vehicle, &frame.views)
+}
+
+fn annotation(name: &str, camera: &Camera, truth: &TrueState, gnss: Pose, views: &[LineView]) -> Annotation {
+    let stem = lanemap_openlane::timestamp_stem(truth.time);
     Annotation {
         path: std::path::PathBuf::new(),
         intrinsic: camera.intrinsic,
         vehicle_from_camera: camera.vehicle_from_camera,
-        world_from_vehicle: Some(frame.truth.world_from_vehicle),
-        world_from_vehicle_gnss: Some(frame.gnss_world_from_vehicle),
+        world_from_vehicle: Some(truth.world_from_vehicle),
+        world_from_vehicle_gnss: Some(gnss),
         image: format!("simulated/{name}/{stem}.jpg"),
-        lanes: frame.views.iter().map(|view| annotated(view, &frame.views, &camera.vehicle_from_camera)).collect(),
+        lanes: views.iter().map(|view| annotated(view, views, &camera.vehicle_from_camera)).collect(),
     }
 }
 
@@ -162,9 +170,8 @@ fn attribute(view: &LineView, all: &[LineView]) -> i64 {
     }
 }
 
-fn detections_of(frame: &SimulatedFrame, ground: &GroundFrame, rng: &mut SimRng) -> DetectionFile {
-    let lanes = frame
-        .detections
+fn detections_of(detections: &[Detection], ground: &GroundFrame, rng: &mut SimRng) -> DetectionFile {
+    let lanes = detections
         .iter()
         .map(|detection| DetectedLane {
             category: detection.category,

@@ -53,7 +53,12 @@ struct SeenLine {
 impl TruthMap {
     /// Adds what one frame had in sight.
     pub fn observe(&mut self, frame: &SimulatedFrame) {
-        for view in &frame.views {
+        self.observe_views(&frame.views);
+    }
+
+    /// Adds what was in sight in one frame.
+    pub fn observe_views(&mut self, views: &[LineView]) {
+        for view in views {
             let LineView { category, stretch, .. } = view;
             let seen = self.seen.entry(view.line).or_insert_with(|| SeenLine {
                 category: *category,
@@ -68,14 +73,21 @@ impl TruthMap {
     /// The lines so far, in the order of their numbers.
     #[must_use]
     pub fn lines(&self, network: &RoadNetwork) -> Vec<TrueLine> {
+        self.lines_by(|id| Some(network.line(id)))
+    }
+
+    /// The lines so far, in the order of their numbers, where lines are found by their numbers.
+    pub(crate) fn lines_by<'a>(&self, line_of: impl Fn(RoadLineId) -> Option<&'a RoadLine>) -> Vec<TrueLine> {
         self.seen
             .iter()
             .filter(|(_, seen)| seen.frames >= MIN_FRAMES)
-            .map(|(line, seen)| TrueLine {
-                line: *line,
-                category: seen.category,
-                frames_seen: seen.frames,
-                points: stretch_of(network.line(*line), &seen.stretch),
+            .filter_map(|(line, seen)| {
+                Some(TrueLine {
+                    line: *line,
+                    category: seen.category,
+                    frames_seen: seen.frames,
+                    points: stretch_of(line_of(*line)?, &seen.stretch),
+                })
             })
             .collect()
     }

@@ -6,8 +6,8 @@ use std::{
 };
 
 use lanemap_client::{ClientError, IngestClient, Session, SessionStart};
-use lanemap_core::{Frame, FrameError, FrameLimits, TimestampNs, geometry::georeference::Georeference};
-use lanemap_simulator::{DriveSimulation, Scenario, drive::motion::FRAME_RATE_HZ, road::RoadNetwork};
+use lanemap_core::{Frame, FrameError, FrameLimits, FrameParts, TimestampNs};
+use lanemap_simulator::{drive::motion::FRAME_RATE_HZ, fleet::FleetDrive};
 use thiserror::Error;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
@@ -32,18 +32,15 @@ enum DriveError {
 
 /// What all vehicles share.
 struct Town {
-    scenario: Scenario,
-    network: RoadNetwork,
-    on_earth: Georeference,
+    fleet: lanemap_simulator::Fleet,
     began_unix_s: u64,
 }
 
 impl Fleet {
     /// Lets so many vehicles drive, each on a connection of its own session.
-    pub fn start(vehicles: u32, scenario: &Scenario, on_earth: Georeference, client: &IngestClient) -> Self {
-        let network = RoadNetwork::build(&scenario.network, scenario.max_grade, scenario.seed);
+    pub fn start(vehicles: u32, fleet: lanemap_simulator::Fleet, client: &IngestClient) -> Self {
         let began_unix_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-        let town = Arc::new(Town { scenario: *scenario, network, on_earth, began_unix_s });
+        let town = Arc::new(Town { fleet, began_unix_s });
         let (tasks, stop) = (TaskTracker::new(), CancellationToken::new());
         for vehicle in 0..vehicles {
             let drives = (vehicle..).step_by(vehicles as usize);
@@ -95,34 +92,27 @@ async fn one_drive(
     client: &IngestClient,
     stop: &CancellationToken,
 ) -> Result<(), DriveError> {
-    let drive = DriveSimulation::start(&town.scenario, &town.network, number);
+    let drive = town.fleet.drive(number);
     let start = SessionStart {
-        sensor: town.scenario.camera.sensor(),
+        sensor: drive.sensor(),
         ..SessionStart::new("demo", format!("vehicle-{vehicle}"), format!("{}-{number}", town.began_unix_s))
     };
     let (mut session, _events) = client.start_session(start).await?;
-    let all_driven = stream(&mut session, drive, &town.on_earth, stop).await?;
+    let all_driven = stream(&mut session, &drive, stop).await?;
     let summary = if all_driven { session.finish().await? } else { session.close().await? };
     tracing::debug!(vehicle, number, ?summary, "drive over");
     Ok(())
 }
 
 /// Sends the frames at 10 Hz; `false` where it was stopped before the last.
-async fn stream(
-    session: &mut Session,
-    drive: DriveSimulation<'_>,
-    on_earth: &Georeference,
-    stop: &CancellationToken,
-) -> Result<bool, DriveError> {
+async fn stream(session: &mut Session, drive: &FleetDrive<'_>, stop: &CancellationToken) -> Result<bool, DriveError> {
     let began_ns = now_ns();
     let mut ticks = interval(Duration::from_secs_f64(1.0 / FRAME_RATE_HZ));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
     let _: Instant = ticks.tick().await;
-    let recorded_ns = drive.states().first().map_or(0, |state| state.time.0);
-    for frame in drive {
-        let mut parts = frame.parts(Some(on_earth));
-        parts.time = TimestampNs(parts.time.0 - recorded_ns + began_ns);
-        let frame = Frame::new(parts, &FrameLimits::default())?;
+    let later_ns = began_ns - drive.start().0;
+    for frame in drive.frames() {
+        let frame = later(&frame, later_ns)?;
         tokio::select! {
             () = stop.cancelled() => return Ok(false),
             sent = session.send(&frame) => sent?,
@@ -133,6 +123,19 @@ async fn stream(
         }
     }
     Ok(true)
+}
+
+/// The frame at a later time.
+fn later(frame: &Frame, later_ns: i64) -> Result<Frame, FrameError> {
+    let parts = FrameParts {
+        sequence: frame.sequence(),
+        time: TimestampNs(frame.time().0 + later_ns),
+        odometry: frame.odometry().clone(),
+        gnss: frame.gnss().copied(),
+        detections: frame.detections().to_vec(),
+        occlusions: frame.occlusions().to_vec(),
+    };
+    Frame::new(parts, &FrameLimits::default())
 }
 
 fn now_ns() -> i64 {

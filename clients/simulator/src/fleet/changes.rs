@@ -321,6 +321,15 @@ impl Epoch {
         self.pieces.get(&id).map_or_else(|| std::slice::from_ref(network.line(id)), Vec::as_slice)
     }
 
+    /// A line or piece of a line that is there, by its number.
+    pub(super) fn find<'a>(&'a self, network: &'a RoadNetwork, id: RoadLineId) -> Option<&'a RoadLine> {
+        let whole = whole_line(id);
+        if (whole.0 as usize) < network.lines().len() {
+            return self.line(network, whole).iter().find(|line| line.id == id);
+        }
+        self.temporary.values().flatten().find(|line| line.id == id)
+    }
+
     /// The temporary lines of a link.
     pub(super) fn temporary(&self, link: LinkIndex) -> &[RoadLine] {
         self.temporary.get(&link).map_or(&[], Vec::as_slice)

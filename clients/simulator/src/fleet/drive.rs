@@ -16,7 +16,7 @@ use crate::{
     detector::Detector,
     drive::{Path, Route, TrueState, motion::FRAME_RATE_HZ},
     random::Purpose,
-    road::RoadLine,
+    road::{RoadLine, RoadLineId},
     view::{LineView, legs_in_sight, line_ids_ahead, views_of},
 };
 
@@ -131,6 +131,12 @@ impl<'a> FleetDrive<'a> {
     #[must_use]
     pub fn length_m(&self) -> f64 {
         self.states.last().map_or(0.0, |state| state.distance_m)
+    }
+
+    /// A line, or a piece of one, as it is in this drive, by the number that its views bear.
+    #[must_use]
+    pub fn line(&self, id: RoadLineId) -> Option<&RoadLine> {
+        self.epoch.find(&self.fleet.network, id)
     }
 
     /// The frames that the vehicle streams.

@@ -26,7 +26,7 @@ const SWING_M: f64 = 40.0;
 const BEND_M: f64 = 300.0;
 
 /// The course of a single road in plan.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Course {
     /// From west to east through the origin.
     Straight,

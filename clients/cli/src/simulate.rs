@@ -19,7 +19,8 @@ const MAX_TOTAL_KM: f64 = 1_000.0;
 /// What to simulate.
 #[derive(Args, Debug)]
 pub struct SimulateArgs {
-    /// Folder to write into; made where it does not exist. Gets segment-sim-*, results, maps, network.geojson, index.json
+    /// Folder to write into; made where it does not exist. Gets segment-*, results, maps, network.geojson, index.json;
+    /// of a fleet also network-before.geojson and changes.geojson
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// The roads

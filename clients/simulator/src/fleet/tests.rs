@@ -4,6 +4,7 @@ use lanemap_core::Frame;
 use nalgebra::Vector3;
 
 use super::*;
+use crate::road::LinkKind;
 
 fn road(drives: u32) -> FleetScenario {
     let routes = FleetRoutes::Shared { length_m: 250.0, both_directions: true };
@@ -195,4 +196,30 @@ fn vehicles_keep_to_their_lanes_and_leave_the_ego_vehicle_its_room() {
     }
     let per_km = f64::from(counted) / f64::from(frames) / 0.11 / 4.0;
     assert!((5.0..14.0).contains(&per_km), "{per_km} vehicles a kilometre and lane");
+}
+
+#[test]
+fn nobody_crosses_a_solid_line_on_the_motorway_and_its_ramps() {
+    use lanemap_core::Category;
+    let fleet = FleetScenario { lane_changes_per_km: 2.0, ..FleetScenario::small_town(150) }.fleet(Seed(6));
+    let network = fleet.network();
+    let (mut ramps, mut frames) = (0, 0);
+    for drive in fleet.drives() {
+        let kind = |leg: usize| network.link(drive.route().legs[leg].link).kind;
+        ramps += drive.route().legs.iter().filter(|leg| network.link(leg.link).kind == LinkKind::Ramp).count();
+        let on_motorway = |leg: usize| matches!(kind(leg), LinkKind::Motorway { .. } | LinkKind::Ramp);
+        for state in drive.states().iter().filter(|state| on_motorway(state.leg)).step_by(5) {
+            frames += 1;
+            let place = state.world_from_vehicle.translation.vector.xy();
+            for line in &network.link(drive.route().legs[state.leg].link).lines {
+                let line = network.line(*line);
+                if matches!(line.category, Category::WhiteSolid | Category::YellowSolid) {
+                    let nearest = line.points.iter().map(|point| (point.xy().coords - place).norm());
+                    let nearest_m = nearest.fold(f64::INFINITY, f64::min);
+                    assert!(nearest_m > 0.8, "drive {} at {place}: {nearest_m} m from a solid line", drive.number());
+                }
+            }
+        }
+    }
+    assert!(ramps >= 10 && frames > 1_000, "{ramps} ramps, {frames} frames");
 }

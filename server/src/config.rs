@@ -114,7 +114,7 @@ pub struct ServerConfig {
     pub unload_after_s: u64,
     /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for.
     pub max_cached_map_bytes: usize,
-    /// Threads that fuse the shared map, 0 to 64; 0: it stands still.
+    /// Threads that fuse the shared map, 1 to 64.
     pub fuse_threads: usize,
     /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once.
     pub fuse_interval_ms: u64,
@@ -312,7 +312,7 @@ impl ServerConfig {
         within("publish_interval_ms", self.publish_interval_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;
         within("unload_after_s", self.unload_after_s as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("max_cached_map_bytes", self.max_cached_map_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
-        within("fuse_threads", self.fuse_threads as f64, 0.0, 64.0, "0 ..= 64")?;
+        within("fuse_threads", self.fuse_threads as f64, 1.0, 64.0, "1 ..= 64")?;
         within("fuse_interval_ms", self.fuse_interval_ms as f64, 0.0, 3_600_000.0, "0 ..= 3600000")?;
         within("fuse_cpu_share", self.fuse_cpu_share, 0.01, 1.0, "0.01 ..= 1")?;
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;

@@ -20,7 +20,7 @@ pub mod wire;
 mod worker;
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -42,7 +42,7 @@ use crate::{
     session::{MapVersion, SessionId},
 };
 use bases::Bases;
-use cell_record::fingerprint;
+use cell_record::{FORMAT, fingerprint};
 use queue::Queue;
 use worker::Worker;
 
@@ -82,6 +82,8 @@ struct Shared {
     bases: Bases,
     /// Told when there is more in the queue, or nothing more will come.
     woken: Condvar,
+    /// Drives that a crash interrupted have been asked what they say.
+    recovered: AtomicBool,
     stopping: AtomicBool,
     /// Counts tasks that were done.
     done: watch::Sender<u64>,
@@ -101,7 +103,13 @@ impl Fuser {
         store: &CellStore,
         map: SharedMap,
     ) -> Result<FuseThreads, JournalError> {
-        let records = store.told::<CellRecord>()?;
+        store.adopt_format(FORMAT)?;
+        let told = store.told::<CellRecord>()?.into_iter();
+        let records: BTreeMap<CellId, CellRecord> = told
+            .map(|(cell, (version, told))| {
+                (cell, CellRecord { version: CellVersion(version), ..told.unwrap_or_default() })
+            })
+            .collect();
         let facts = store.facts()?;
         let purges: BTreeSet<CellId> = store.purges()?.into_iter().collect();
         let now = Instant::now();
@@ -125,6 +133,7 @@ impl Fuser {
             queue: Mutex::new(queue),
             bases: Bases::new(),
             woken: Condvar::new(),
+            recovered: AtomicBool::new(false),
             stopping: AtomicBool::new(false),
             done: watch::Sender::default(),
         };
@@ -137,6 +146,15 @@ impl Fuser {
             spawned.map_err(|error| JournalError::Store(format!("a fusing thread does not start: {error}")))
         });
         Ok(FuseThreads { threads: threads.collect::<Result<_, _>>()?, fuser })
+    }
+
+    /// Begins to fuse cells: drives that a crash interrupted have said what they have to say, so that no cell is fused
+    /// without them.
+    pub(crate) fn begin(&self) {
+        let queue = self.queue();
+        self.shared.recovered.store(true, Ordering::Relaxed);
+        drop(queue);
+        self.shared.woken.notify_all();
     }
 
     /// Takes what a drive says now, in the place of what it said before. Does not wait.
@@ -178,7 +196,7 @@ impl Fuser {
     /// Waits until the queue is as it should be, or nothing is done any more.
     async fn wait_until(&self, holds: impl Fn(&mut Queue) -> bool) {
         let mut done = self.shared.done.subscribe();
-        while !holds(&mut self.queue()) && !self.is_stopping() && self.shared.settings.threads > 0 {
+        while !holds(&mut self.queue()) && !self.is_stopping() {
             if done.changed().await.is_err() {
                 return;
             }

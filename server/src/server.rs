@@ -145,11 +145,12 @@ impl Server {
         let router = router.layer(middleware::from_fn_with_state(Arc::clone(&credentials.authenticator), authenticate));
         tokio::spawn(registry.clone().keep_erasing());
         tokio::spawn({
-            let registry = registry.clone();
+            let (registry, fuser) = (registry.clone(), fuse_threads.fuser());
             async move {
                 if let Err(error) = registry.wake_unsaved().await {
                     tracing::warn!(%error, "what is told of drives that a crash interrupted is not up to date");
                 }
+                fuser.begin();
             }
         });
         let zenoh = match config.zenoh_mode {

@@ -16,7 +16,7 @@ use lanemap_server::{
     Server, ServerConfig,
     fuse::{
         SharedMap,
-        wire::{apply, positions},
+        wire::{apply, parse_lane_id, positions},
     },
 };
 use lanemap_tests::{
@@ -356,6 +356,30 @@ async fn a_drive_without_gnss_stays_in_its_own_frame_and_says_so() {
     };
     assert_eq!((placement(&placed).as_str(), placement(&apart).as_str()), ("shared map", "own frame"));
     assert_eq!(json(&format!("{}/cells", server.url())).await["cells"][0]["drives"], 1);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ends_of_a_trip_that_are_cut_off_tell_the_shared_map_neither_place_nor_time() {
+    let drives = along_a_road(11, 1, 300.0, false);
+    let folder = tempfile::tempdir().unwrap();
+    let config = ServerConfig { trip_cut_m: 60.0, ..servers::config(folder.path()) };
+    let server = Server::start(config).await.unwrap();
+    drives[0].upload_whole(&server.url()).await;
+    settled_where(server.map(), |map| map.list().iter().any(|(_, record)| record.lanes > 0)).await;
+    let frames = &drives[0].frames;
+    let travelled = |frame: &v1::Frame| {
+        let position = frame.odometry.as_ref().unwrap().odometry_from_vehicle.unwrap().position.unwrap();
+        position.x.hypot(position.y)
+    };
+    let whole_m = travelled(frames.last().unwrap());
+    let mapped = |frame: &&v1::Frame| travelled(frame) > 58.0 && travelled(frame) < whole_m - 58.0;
+    let first = frames.iter().find(mapped).unwrap().time_unix_ns;
+    let last = frames.iter().rev().find(mapped).unwrap().time_unix_ns;
+    for lane in &cell_maps(&server.url()).await[0].lanes {
+        let started = parse_lane_id(&lane.id).unwrap().started.0;
+        assert!(started >= first && lane.first_seen_unix_ns >= first && lane.last_seen_unix_ns <= last, "{lane:?}");
+    }
     server.shutdown().await;
 }
 

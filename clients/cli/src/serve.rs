@@ -176,7 +176,7 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_CACHED_MAP_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
     max_cached_map_bytes: Option<usize>,
-    /// Threads that fuse the shared map, 0 to 64; 0: it stands still [env: LANEMAP_FUSE_THREADS] [default: 1]
+    /// Threads that fuse the shared map, 1 to 64 [env: LANEMAP_FUSE_THREADS] [default: 1]
     #[arg(long, value_name = "N")]
     fuse_threads: Option<usize>,
     /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once

@@ -10,6 +10,10 @@ use crate::{journal::cells::ContributionFact, session::SessionId};
 /// Raise it where the same contributions give another map: every cell is then fused again at the next start.
 const ALGORITHM: u32 = 1;
 
+/// Raise it where the bytes of contributions or of fused cells change: what an earlier build wrote is then written anew from
+/// the drives' snapshots.
+pub(super) const FORMAT: u16 = 1;
+
 /// Version of a cell: grows by one with every change of its map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct CellVersion(pub u64);
@@ -45,6 +49,7 @@ pub(super) fn fingerprint<'a>(facts: impl IntoIterator<Item = &'a ContributionFa
     facts.sort_unstable();
     let mut hasher = Xxh3::new();
     hasher.update(&ALGORITHM.to_le_bytes());
+    hasher.update(&FORMAT.to_le_bytes());
     hasher.update(format!("{:?}", FleetParams::default()).as_bytes());
     for fact in facts {
         hasher.update(&fact.started.0.to_le_bytes());

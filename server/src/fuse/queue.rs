@@ -23,6 +23,17 @@ pub(super) enum Task {
     Fuse(CellId),
 }
 
+/// Which tasks are to be taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Wanted {
+    /// Those that are due.
+    All,
+    /// Drives that are due.
+    Drives,
+    /// Drives, whether they are due or not.
+    DrivesAtOnce,
+}
+
 /// A task that was taken.
 #[derive(Debug)]
 pub(super) enum Taken {
@@ -103,14 +114,13 @@ impl Queue {
         self.due.insert((at, task));
     }
 
-    /// The task that became due first; or when the next one will be, `None` where there is none. With `ending`, drives
-    /// only, and at once.
-    pub(super) fn take(&mut self, now: Instant, ending: bool) -> Result<Taken, Option<Instant>> {
+    /// The task that became due first; or when the next one will be, `None` where there is none.
+    pub(super) fn take(&mut self, now: Instant, wanted: Wanted) -> Result<Taken, Option<Instant>> {
         let is_free = |task: &Task| !self.in_work.contains(task);
-        let is_wanted = |task: &Task| !ending || matches!(task, Task::Contribute(_));
+        let is_wanted = |task: &Task| wanted == Wanted::All || matches!(task, Task::Contribute(_));
         let first = self.due.iter().find(|(_, task)| is_free(task) && is_wanted(task)).copied();
         let Some((at, task)) = first else { return Err(None) };
-        if at > now && !ending {
+        if at > now && wanted != Wanted::DrivesAtOnce {
             return Err(Some(at));
         }
         self.remove(task);
@@ -118,7 +128,7 @@ impl Queue {
             Task::Contribute(session) => self.offers.remove(&session).map(|offer| Taken::Contribute(Box::new(offer))),
             Task::Fuse(cell) => Some(Taken::Fuse(cell)),
         };
-        let Some(taken) = taken else { return self.take(now, ending) };
+        let Some(taken) = taken else { return self.take(now, wanted) };
         self.in_work.insert(task);
         Ok(taken)
     }
@@ -221,7 +231,7 @@ mod tests {
     }
 
     fn taken_cell(queue: &mut Queue, now: Instant) -> Option<CellId> {
-        match queue.take(now, false) {
+        match queue.take(now, Wanted::All) {
             Ok(Taken::Fuse(cell)) => Some(cell),
             _ => None,
         }
@@ -241,7 +251,7 @@ mod tests {
         assert_eq!(taken_cell(&mut queue, now), Some(cell(1)));
         queue.finish(Task::Fuse(cell(1)), now);
         queue.touch_cell(cell(1), now);
-        assert!(matches!(queue.take(now, false), Err(Some(at)) if at == now + INTERVAL));
+        assert!(matches!(queue.take(now, Wanted::All), Err(Some(at)) if at == now + INTERVAL));
         assert_eq!(taken_cell(&mut queue, now + INTERVAL), Some(cell(1)));
     }
 
@@ -260,14 +270,17 @@ mod tests {
         let (mut queue, now) = (Queue::new(INTERVAL), Instant::now());
         let place = Some(georeference(11.58, 48.14));
         assert!(queue.offer(offer(1, 1, place), now) && queue.offer(offer(1, 2, place), now));
-        let Ok(Taken::Contribute(taken)) = queue.take(now, false) else { panic!("an offer") };
+        let Ok(Taken::Contribute(taken)) = queue.take(now, Wanted::All) else { panic!("an offer") };
         assert_eq!(taken.version, MapVersion(2));
         queue.finish(Task::Contribute(taken.session), now);
         queue.has_contributed(taken.session, Contributed { version: MapVersion(2), cells: vec![] });
         assert!(!queue.offer(offer(1, 2, place), now));
         assert!(!queue.offer(offer(2, 7, None), now), "it has no place on the earth");
         assert!(queue.offer(offer(1, 3, place), now));
-        assert!(matches!(queue.take(now, true), Ok(Taken::Contribute(_))), "at once where the service ends");
+        assert!(
+            matches!(queue.take(now, Wanted::DrivesAtOnce), Ok(Taken::Contribute(_))),
+            "at once where the service ends"
+        );
     }
 
     #[test]
@@ -275,11 +288,11 @@ mod tests {
         let (mut queue, now) = (Queue::new(INTERVAL), Instant::now());
         let place = Some(georeference(11.58, 48.14));
         queue.offer(offer(1, 1, place), now);
-        let taken = queue.take(now, false).unwrap();
+        let taken = queue.take(now, Wanted::All).unwrap();
         queue.offer(offer(1, 2, place), now);
         queue.retry(taken, now, INTERVAL);
-        assert!(matches!(queue.take(now, false), Err(Some(at)) if at == now + INTERVAL));
-        let Ok(Taken::Contribute(taken)) = queue.take(now + INTERVAL, false) else { panic!("an offer") };
+        assert!(matches!(queue.take(now, Wanted::All), Err(Some(at)) if at == now + INTERVAL));
+        let Ok(Taken::Contribute(taken)) = queue.take(now + INTERVAL, Wanted::All) else { panic!("an offer") };
         assert_eq!(taken.version, MapVersion(2));
     }
 }

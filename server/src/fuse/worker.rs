@@ -1,7 +1,7 @@
 //! A thread that cuts drives into contributions and fuses cells, one task after the other.
 
 use std::{
-    sync::PoisonError,
+    sync::{PoisonError, atomic::Ordering},
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
@@ -13,7 +13,7 @@ use super::{
     CellRecord, CellVersion, Fuser, Offer,
     border::{self, Crossing, Piece},
     cell_record::fingerprint,
-    queue::{Taken, Task},
+    queue::{Taken, Task, Wanted},
     wire,
 };
 use crate::{
@@ -81,13 +81,23 @@ impl Worker {
         }
     }
 
+    /// Which tasks are done now: drives only until those that a crash interrupted have been asked, and when the service
+    /// stops.
+    fn wanted(&self) -> Wanted {
+        match (self.fuser.is_stopping(), self.fuser.shared.recovered.load(Ordering::Relaxed)) {
+            (true, _) => Wanted::DrivesAtOnce,
+            (false, false) => Wanted::Drives,
+            (false, true) => Wanted::All,
+        }
+    }
+
     /// Waits for the next task; `None` where none will come.
     fn next(&self) -> Option<Taken> {
         let mut queue = self.fuser.queue();
         loop {
             let stopping = self.fuser.is_stopping();
             let woken = &self.fuser.shared.woken;
-            match queue.take(Instant::now(), stopping) {
+            match queue.take(Instant::now(), self.wanted()) {
                 Ok(taken) => return Some(taken),
                 Err(_) if stopping => return None,
                 Err(None) => queue = woken.wait(queue).unwrap_or_else(PoisonError::into_inner),
@@ -190,6 +200,7 @@ impl Worker {
         });
         let write = CellWrite {
             cell,
+            newest: record.version.0,
             told: encoded("a cell", &record)?,
             lines: fused.as_ref().map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
             outdated: self.outdated(cell, next.is_some(), purged)?,

@@ -5,7 +5,7 @@
 //! | `contributions`     | cell, then session, 8 bytes each       | what a drive says of a cell, postcard      |
 //! | `contribution_facts`| the same                               | [`ContributionFact`], postcard             |
 //! | `contributed`       | session                                | [`Contributed`], postcard                  |
-//! | `cells`             | cell                                   | what is told of the cell, the fuser's own  |
+//! | `cells`             | cell                                   | its version, 8 bytes, and what is told of it |
 //! | `cell_lines`        | cell                                   | its lines as fused, the fuser's own        |
 //! | `cell_versions`     | cell, then version, 8 bytes big-endian | when it was published, then its bytes      |
 //! | `cell_purges`       | cell                                   | none: a drive in it was deleted            |
@@ -28,6 +28,9 @@ use super::{
     store::{Reopenable, Store, StoreBatch},
 };
 use crate::session::{MapVersion, SessionId};
+
+/// Key in the keyspace `facts`: the form in which contributions are kept.
+const MAP_FORMAT: &str = "map format";
 
 /// A contribution on its way into the store.
 #[derive(Clone, Debug)]
@@ -71,6 +74,8 @@ pub(crate) struct NewVersion {
 #[derive(Clone, Debug)]
 pub(crate) struct CellWrite {
     pub(crate) cell: CellId,
+    /// Its newest version.
+    pub(crate) newest: u64,
     /// What is told of it.
     pub(crate) told: Vec<u8>,
     /// Its lines as fused; `None` where they stay.
@@ -103,15 +108,28 @@ impl Journal {
 }
 
 impl CellStore {
-    /// What is told of every cell.
-    pub(crate) fn told<T: DeserializeOwned>(&self) -> Result<BTreeMap<CellId, T>, JournalError> {
+    /// Makes sure that contributions have the form of this build: those of another are removed, to be given again.
+    pub(crate) fn adopt_format(&self, format: u16) -> Result<(), JournalError> {
+        let store = self.store.get()?;
+        if store.facts.get(MAP_FORMAT)?.as_deref() == Some(&format.to_be_bytes()) {
+            return Ok(());
+        }
+        for keyspace in [&store.contributions, &store.contribution_facts, &store.contributed] {
+            keyspace.clear()?;
+        }
+        Ok(store.facts.insert(MAP_FORMAT, format.to_be_bytes())?)
+    }
+
+    /// Version of every cell, and what is told of it, where it has the form of this build.
+    pub(crate) fn told<T: DeserializeOwned>(&self) -> Result<BTreeMap<CellId, (u64, Option<T>)>, JournalError> {
         self.store
             .get()?
             .cells
             .iter()
             .map(|entry| {
                 let (key, value) = entry.into_inner()?;
-                Ok((cell_of(&key)?, decoded("a cell", &value)?))
+                let (version, told) = value.split_at_checked(8).unwrap_or_default();
+                Ok((cell_of(&key)?, (number(Some(version))?, postcard::from_bytes(told).ok())))
             })
             .collect()
     }
@@ -225,7 +243,8 @@ impl CellStore {
 impl StoreBatch<'_> {
     fn put_cell(&mut self, write: CellWrite) {
         let cell = write.cell;
-        self.batch.insert(&self.store.cells, cell.to_key(), write.told);
+        let told = [write.newest.to_be_bytes().as_slice(), &write.told].concat();
+        self.batch.insert(&self.store.cells, cell.to_key(), told);
         if let Some(lines) = write.lines {
             self.batch.insert(&self.store.cell_lines, cell.to_key(), lines);
         }

@@ -37,6 +37,29 @@ pub(crate) struct Drive {
     mapped: Option<(Sequence, TimestampNs)>,
 }
 
+/// Raise it where the bytes of a [`Trace`] change: what an earlier build wrote is then passed over.
+const TRACE_FORMAT: u16 = 1;
+
+/// The trace as a snapshot has it.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct TracePart {
+    format: u16,
+    bytes: Vec<u8>,
+}
+
+impl TracePart {
+    /// The trace; an empty one where another build wrote it, for a drive can be mapped on without.
+    fn read(&self) -> Trace {
+        if self.format != TRACE_FORMAT {
+            return Trace::default();
+        }
+        postcard::from_bytes(&self.bytes).unwrap_or_else(|error| {
+            tracing::error!(%error, "a drive's trace does not decode, and is begun anew");
+            Trace::default()
+        })
+    }
+}
+
 /// What is cut off the ends of a drive's trips. Stands still where nothing is cut.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Ends {
@@ -146,14 +169,15 @@ impl Drive {
         let ((progress, mapper), rest): ((Progress, Vec<u8>), _) = postcard::take_from_bytes(bytes)?;
         // Snapshots of earlier builds end here, or after the next part.
         let (ends, rest) = part_of(rest)?;
-        let (trace, _) = part_of(rest)?;
+        let (trace, _) = part_of::<TracePart>(rest)?;
         let mapped = progress.last;
-        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace), progress, cut, ends, mapped })
+        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace.read()), progress, cut, ends, mapped })
     }
 
     /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
     pub(crate) fn snapshot(&self) -> Result<Vec<u8>, DriveError> {
-        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot(), &self.ends, &*self.trace))?)
+        let trace = TracePart { format: TRACE_FORMAT, bytes: postcard::to_stdvec(&*self.trace)? };
+        Ok(postcard::to_stdvec(&(&self.progress, self.mapper.snapshot(), &self.ends, trace))?)
     }
 
     /// How far the drive has come, as bytes, where every frame since the last snapshot was cut.

@@ -4,6 +4,7 @@ mod association;
 mod association_method;
 mod association_pairs;
 mod drives;
+mod fleet;
 mod map_quality;
 mod map_table;
 mod parallel;
@@ -30,6 +31,8 @@ enum Measure {
     Pose(pose::PoseArgs),
     /// Association of the true lanes of two frames with a wrong pose between them, beside the paper's baselines.
     Association(association::AssociationArgs),
+    /// The fused map of many drives, by their number: absolute and relative errors, coverage, precision, names that stay.
+    Fleet(fleet::FleetArgs),
 }
 
 /// What every measure takes.
@@ -89,6 +92,7 @@ pub fn run(args: &EvaluateArgs) -> anyhow::Result<ExitCode> {
         Measure::Map(args) => map_quality::run(args)?,
         Measure::Pose(args) => pose::run(args)?,
         Measure::Association(args) => association::run(args)?,
+        Measure::Fleet(args) => fleet::run(args)?,
     }
     Ok(ExitCode::SUCCESS)
 }

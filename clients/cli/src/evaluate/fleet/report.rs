@@ -1,0 +1,91 @@
+//! The figures of fused maps as tables and as JSON.
+
+use lanemap_core::evaluation::{FleetScore, fleet_score::Quantiles};
+use serde_json::{Value, json};
+
+use super::{ByDrives, FleetArgs, Road};
+use crate::evaluate::table::Table;
+
+/// Prints the figures.
+pub fn print(args: &FleetArgs, figures: &[(&Road, Vec<ByDrives>)]) -> anyhow::Result<()> {
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&as_json(figures))?);
+    } else {
+        print!("{}", as_text(figures));
+    }
+    Ok(())
+}
+
+impl ByDrives {
+    /// Mean of a figure over the choices of drives.
+    pub fn mean(&self, figure: impl Fn(&FleetScore) -> f64) -> f64 {
+        self.scores.iter().map(figure).sum::<f64>() / self.scores.len().max(1) as f64
+    }
+
+    fn quantiles(&self, of: impl Fn(&FleetScore) -> Quantiles) -> Value {
+        json!({ "p50": self.mean(|score| of(score).p50), "p95": self.mean(|score| of(score).p95) })
+    }
+}
+
+fn as_json(figures: &[(&Road, Vec<ByDrives>)]) -> Value {
+    let by_drives = |figure: &ByDrives| {
+        json!({
+            "n": figure.drives,
+            "coverage": figure.mean(|score| score.coverage),
+            "precision": figure.mean(|score| score.precision),
+            "relative_m": figure.quantiles(|score| score.relative),
+            "absolute_m": figure.quantiles(|score| score.absolute),
+            "relative_height_m": figure.quantiles(|score| score.relative_height),
+            "absolute_height_m": figure.quantiles(|score| score.absolute_height),
+            "kept_apart": figure.apart,
+            "kept_ids": figure.kept_names,
+            "bytes_per_km": 1000.0 * figure.bytes / figure.mean(|score| score.length_m).max(1.0),
+            "fuse_ms": figure.fuse_ms,
+        })
+    };
+    let roads = figures.iter().map(
+        |(road, figures)| json!({ "road": road.name, "by_drives": figures.iter().map(by_drives).collect::<Vec<_>>() }),
+    );
+    json!({ "roads": roads.collect::<Vec<_>>() })
+}
+
+fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
+    let mut table = Table::new(&[
+        "road",
+        "drives",
+        "lateral p50",
+        "p95",
+        "absolute p50",
+        "p95",
+        "height p50",
+        "p95",
+        "coverage",
+        "precision",
+        "apart",
+        "same ids",
+        "B/km",
+        "fuse ms",
+    ]);
+    for (road, figures) in figures {
+        for figure in figures {
+            let metres = |of: &dyn Fn(&FleetScore) -> f64| format!("{:.3}", figure.mean(of));
+            table.row(vec![
+                road.name.clone(),
+                figure.drives.to_string(),
+                metres(&|score| score.relative.p50),
+                metres(&|score| score.relative.p95),
+                metres(&|score| score.absolute.p50),
+                metres(&|score| score.absolute.p95),
+                metres(&|score| score.relative_height.p50),
+                metres(&|score| score.relative_height.p95),
+                metres(&|score| score.coverage),
+                metres(&|score| score.precision),
+                format!("{:.1}", figure.apart),
+                figure.kept_names.map_or_else(|| "-".to_owned(), |kept| format!("{kept:.2}")),
+                format!("{:.0}", 1000.0 * figure.bytes / figure.mean(|score| score.length_m).max(1.0)),
+                format!("{:.0}", figure.fuse_ms),
+            ]);
+        }
+    }
+    format!("Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}", table.render())
+}

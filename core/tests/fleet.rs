@@ -2,7 +2,9 @@
 
 mod roads;
 
-use lanemap_core::fleet::{Base, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto};
+use lanemap_core::fleet::{
+    Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto,
+};
 use proptest::prelude::*;
 use roads::{Road, Survey, anchor};
 
@@ -151,4 +153,45 @@ proptest! {
         let shuffled: Vec<Contribution> = order.iter().chain(&again).map(|index| drives[*index].clone()).collect();
         assert_same(&fused(&shuffled), &expected);
     }
+}
+
+/// Drives of a road before and after its line `index` changes to `after`, metres to the left; `None`: it goes.
+fn before_and_after(index: usize, after: Option<f64>) -> FusedMap {
+    let before = Road::bend(150.0);
+    let mut lines = before.lines.clone();
+    match after {
+        Some(left_m) => lines[index].0 = left_m,
+        None => drop(lines.remove(index)),
+    }
+    let changed = Road { lines, ..Road::bend(150.0) };
+    let mut drives = Survey::of(&before, 21).drives(12);
+    let later = Survey::of(&changed, 21).drives(16);
+    drives.truncate(8);
+    drives.extend_from_slice(&later[8..12]);
+    fused(&drives)
+}
+
+#[test]
+fn a_line_that_vanishes_is_noticed_and_is_no_longer_in_the_map() {
+    let map = before_and_after(2, None);
+    assert_eq!(map.lanes.len(), 3);
+    assert_eq!(map.changes.len(), 1, "{:?}", map.changes);
+    let change = &map.changes[0];
+    assert!(matches!(change.kind, ChangeKind::Vanished) && change.probability > 0.5);
+    assert!(change.points.len() >= 40);
+    assert!(change.noticed_by.0 <= 8 + 3, "by the third drive that missed it: {:?}", change.noticed_by);
+}
+
+#[test]
+fn a_line_that_is_moved_is_one_event_and_lies_in_its_new_place() {
+    let map = before_and_after(2, Some(-0.5));
+    assert_eq!(map.lanes.len(), 4);
+    let [change] = map.changes.as_slice() else { panic!("{:?}", map.changes) };
+    let ChangeKind::Moved { by_m } = change.kind else { panic!("{change:?}") };
+    assert!((by_m - 1.2).abs() < 0.4, "{by_m}");
+}
+
+#[test]
+fn a_road_that_stays_as_it_is_has_no_changes() {
+    assert_eq!(fused(&Survey::of(&Road::bend(200.0), 31).drives(12)).changes, Vec::new());
 }

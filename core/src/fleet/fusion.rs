@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     alignment::{RobustScales, Sighting, Target, align},
     base::Base,
+    change::MapChange,
     contribution::{Contribution, DriveId},
     correction::Correction,
     growth::{Growing, Pieces},
@@ -45,6 +46,8 @@ pub struct FusedDrive {
 pub struct FusedMap {
     /// Its lines, in the order of their names.
     pub lanes: Vec<FusedLane>,
+    /// What happened to the road while drives watched, in the order in which it came to be believed.
+    pub changes: Vec<MapChange>,
     /// Its drives that are not folded, in the order of their seniority.
     pub drives: Vec<FusedDrive>,
     /// Number of drives that are folded.
@@ -142,7 +145,7 @@ impl<'a> Fusion<'a> {
             self.align_all();
             self.draw_lines();
         }
-        if self.keep_apart_misfits() {
+        if self.keep_apart_misfits() | self.keep_apart_strangers() {
             self.align_all();
             self.draw_lines();
         }
@@ -293,6 +296,42 @@ impl<'a> Fusion<'a> {
             line.settle(&self.corrections, self.params);
         }
         self.lines.index();
+    }
+
+    /// Takes out drives that went where others did, by what their receivers say, and share no line with them; whether any.
+    ///
+    /// A drive on a road of its own shares none either, but others are not near its way.
+    fn keep_apart_strangers(&mut self) -> bool {
+        let mut shared = vec![(0_usize, 0_usize); self.drives.len()];
+        for knot in self.lines.lines.iter().flat_map(|line| &line.knots) {
+            let several = knot.drives() > 1;
+            for witness in knot.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
+                let (with_others, all) = &mut shared[witness.drive];
+                *with_others += usize::from(several);
+                *all += 1;
+            }
+        }
+        let strangers = shared.iter().enumerate().filter(|(drive, (with_others, all))| {
+            let alone = (*with_others as f64) < self.params.least_shared * *all as f64;
+            self.placed[*drive] && alone && self.goes_where_others_do(*drive)
+        });
+        let strangers: Vec<usize> = strangers.map(|(drive, _)| drive).collect();
+        for drive in &strangers {
+            self.placed[*drive] = false;
+        }
+        !strangers.is_empty()
+    }
+
+    /// Whether most of a drive's way lies near lines of others, more than one of them.
+    fn goes_where_others_do(&self, drive: usize) -> bool {
+        const STRIDE: usize = 5;
+        let way: Vec<_> = self.drives[drive].contribution.trajectory.iter().step_by(STRIDE).collect();
+        let near_others = way.iter().filter(|point| {
+            let place = self.corrections[drive].apply(&point.position, point.arc_m);
+            let near = self.lines.near(&place, self.params.strangers_within_m);
+            near.into_iter().any(|(line, knot)| self.lines.lines[line].knots[knot].drives() > 1)
+        });
+        2 * near_others.count() > way.len()
     }
 
     /// Takes out drives whose lanes do not lie where those of others do, though they were laid on them; whether any.

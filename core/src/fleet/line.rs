@@ -55,6 +55,8 @@ pub struct FusedPoint {
     pub drives: u32,
     /// Probability that it is there, in `[0, 1]`.
     pub existence: f64,
+    /// Start of the last drive that saw it: how fresh it is.
+    pub confirmed: TimestampNs,
 }
 
 /// A line of the shared map.

@@ -37,6 +37,10 @@ pub struct FleetParams {
     pub robust_scale_m: f64,
     /// Median distance of a drive's lanes from the lines that they lie on above which it is kept apart, metres.
     pub most_misfit_m: f64,
+    /// Share of its lanes that a drive must have in common with others, where it went where they did.
+    pub least_shared: f64,
+    /// Distance from others' lines at which a drive counts as having gone where they did, metres.
+    pub strangers_within_m: f64,
     /// Drives that are kept apart at least; the younger ones.
     pub drives_apart: usize,
     /// Drives that are folded at once; the oldest.
@@ -75,6 +79,8 @@ impl Default for FleetParams {
             gate_height_m: 3.0,
             robust_scale_m: 0.3,
             most_misfit_m: 0.35,
+            least_shared: 0.15,
+            strangers_within_m: 70.0,
             drives_apart: 16,
             drives_per_fold: 16,
             rounds: 2,

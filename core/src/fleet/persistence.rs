@@ -12,8 +12,8 @@ use nalgebra::{Point3, Vector3};
 
 use serde::{Deserialize, Serialize};
 
-use super::{correction::Correction, line::Lines, prepared::PreparedPass};
-use crate::sensor::Sensor;
+use super::{contribution::DriveId, correction::Correction, line::Lines, prepared::PreparedPass};
+use crate::{frame::TimestampNs, sensor::Sensor};
 
 /// What a drive says of a knot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,17 +27,23 @@ pub(super) enum Evidence {
 /// Probability that a line that is there is among a drive's lanes, near the vehicle's own lane.
 const SEEN_NEAR: f64 = 0.9;
 /// The same farther to the side.
-const SEEN_FAR: f64 = 0.75;
+const SEEN_FAR: f64 = 0.65;
 /// Probability that a drive has a lane where there is none.
 const SEEN_GHOST: f64 = 0.05;
 /// Probability that a line goes, and that one comes, between two drives.
 const HAZARD: f64 = 0.01;
+/// Probability from which on a knot is believed to be there.
+const STANDS: f64 = 0.75;
+/// Probability below which it is believed to be gone.
+const GONE: f64 = 0.5;
+/// Passes that must have missed a knot before it can be said to have come.
+const LEAST_MISSED: u32 = 2;
 /// Distance to the side from which a line counts as far, metres.
 const FAR_M: f64 = 6.0;
 /// Nearest and farthest place ahead at which a line is expected to be seen, metres.
-const AHEAD_M: std::ops::Range<f64> = 5.0..28.0;
+const AHEAD_M: std::ops::Range<f64> = 5.0..35.0;
 /// Farthest place to the side at which a line is expected to be seen, metres.
-const SIDE_M: f64 = 9.0;
+const SIDE_M: f64 = 13.0;
 /// Places of the way from which a knot must be in view.
 pub(super) const LEAST_VIEWS: u16 = 3;
 
@@ -48,22 +54,44 @@ pub(super) struct Views {
     pub(super) of: Vec<Vec<(u16, f32)>>,
 }
 
-/// Belief that a knot is there.
+/// Who says something of a knot, and when: a drive and its start.
+pub(super) type Speaker = (TimestampNs, DriveId);
+
+/// Belief that a knot is there, and what became of it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Belief {
     pub(super) probability: f64,
+    /// Passes that saw it.
+    seen: u32,
+    /// Passes that missed it before any saw it.
+    missed_before: u32,
+    /// Whether it was believed to be there, and not since to be gone.
+    stands: bool,
+    /// Start of the last drive that saw it.
+    pub(super) confirmed: Option<TimestampNs>,
+    /// The last change, and the drive that made it believed.
+    pub(super) change: Option<(Turn, Speaker)>,
+}
+
+/// What becomes of a knot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Turn {
+    /// It is there, where it was not.
+    Came,
+    /// It is there no more.
+    Went,
 }
 
 impl Default for Belief {
     /// Before any drive.
     fn default() -> Self {
-        Self { probability: 0.5 }
+        Self { probability: 0.5, seen: 0, missed_before: 0, stands: false, confirmed: None, change: None }
     }
 }
 
 impl Belief {
     /// Takes what the next drive says.
-    pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64) {
+    pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64, speaker: Speaker) {
         let coming = self.probability * (1.0 - HAZARD) + (1.0 - self.probability) * HAZARD;
         let seen = if to_the_side_m < FAR_M { SEEN_NEAR } else { SEEN_FAR };
         let (there, not_there) = match evidence {
@@ -71,6 +99,28 @@ impl Belief {
             Evidence::Missed => (1.0 - seen, 1.0 - SEEN_GHOST),
         };
         self.probability = coming * there / (coming * there + (1.0 - coming) * not_there);
+        match evidence {
+            Evidence::Seen => {
+                self.seen += 1;
+                self.confirmed = Some(speaker.0);
+            }
+            Evidence::Missed if self.seen == 0 => self.missed_before += 1,
+            Evidence::Missed => {}
+        }
+        self.turn(speaker);
+    }
+
+    /// Notes a change, once it is believed. That a line is there is none where nobody passed before.
+    fn turn(&mut self, speaker: Speaker) {
+        if !self.stands && self.probability >= STANDS {
+            self.stands = true;
+            let was_missing = self.missed_before >= LEAST_MISSED || self.change.is_some();
+            self.change = was_missing.then_some((Turn::Came, speaker));
+        } else if self.stands && self.probability < GONE {
+            self.stands = false;
+            // What one drive saw was not believed by others: it was never there.
+            self.change = (self.seen > 1).then_some((Turn::Went, speaker));
+        }
     }
 }
 
@@ -81,7 +131,7 @@ pub(super) fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Corre
         let place = correction.apply(&point.position, point.arc_m);
         let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
         let middle = place + Vector3::new(cos, sin, 0.0) * (0.5 * (AHEAD_M.start + AHEAD_M.end));
-        lines.for_each_knot_near(&middle, 16.0, |line, knot, at: &Point3<f64>| {
+        lines.for_each_knot_near(&middle, 20.0, |line, knot, at: &Point3<f64>| {
             let offset = at - place;
             let ahead = cos * offset.x + sin * offset.y;
             let left = -sin * offset.x + cos * offset.y;
@@ -104,27 +154,34 @@ pub(super) fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Corre
 mod tests {
     use super::*;
 
-    fn after(evidence: &[Evidence]) -> f64 {
+    use Evidence::{Missed, Seen};
+
+    fn after(evidence: &[Evidence]) -> Belief {
         let mut belief = Belief::default();
-        for evidence in evidence {
-            belief.hear(*evidence, 2.0);
+        for (number, evidence) in (0..).zip(evidence) {
+            belief.hear(*evidence, 2.0, (TimestampNs(number), DriveId(0)));
         }
-        belief.probability
+        belief
     }
 
     #[test]
     fn one_drive_suffices_until_others_miss_what_it_saw() {
-        use Evidence::{Missed, Seen};
-        assert!(after(&[Seen]) > 0.9);
-        assert!(after(&[Seen, Missed, Missed]) < 0.5);
-        assert!(after(&[Seen, Seen, Missed, Seen]) > 0.9);
+        assert!(after(&[Seen]).probability > 0.9);
+        assert!(after(&[Seen, Missed, Missed]).probability < 0.5);
+        assert!(after(&[Seen, Seen, Missed, Seen]).probability > 0.9);
+        assert_eq!(after(&[Seen, Missed, Missed]).change, None, "a ghost is no change");
     }
 
     #[test]
-    fn a_line_that_goes_is_given_up_within_three_drives() {
-        use Evidence::{Missed, Seen};
+    fn a_line_that_goes_is_given_up_within_three_drives_and_one_that_comes_is_noticed_within_two() {
         let mut drives = vec![Seen; 30];
         drives.extend([Missed; 3]);
-        assert!(after(&drives) < 0.5);
+        let (turn, (when, _)) = after(&drives).change.unwrap();
+        assert!(turn == Turn::Went && when.0 < 33);
+        let mut drives = vec![Missed; 10];
+        drives.extend([Seen; 2]);
+        let (turn, (when, _)) = after(&drives).change.unwrap();
+        assert!(turn == Turn::Came && when.0 < 12);
+        assert_eq!(after(&[Seen; 5]).change, None);
     }
 }

@@ -18,14 +18,15 @@ impl Fusion<'_> {
         let of_line = |line: &Line| line.knots.iter().map(|knot| knot.record.belief).collect();
         let mut beliefs: Vec<Vec<Belief>> = self.lines.lines.iter().map(of_line).collect();
         for (drive, number, pass) in self.passes() {
-            let sensor = &self.drives[drive].contribution.sensor;
+            let contribution = self.drives[drive].contribution;
+            let (sensor, speaker) = (&contribution.sensor, contribution.seniority());
             let views = views(pass, sensor, &self.corrections[drive], &self.lines);
             for ((line, beliefs), views) in self.lines.lines.iter().zip(&mut beliefs).zip(&views.of) {
                 for ((knot, belief), (views, side_m)) in line.knots.iter().zip(beliefs).zip(views) {
                     if knot.witnesses.iter().any(|witness| witness.pass == number) {
-                        belief.hear(Evidence::Seen, f64::from(*side_m));
+                        belief.hear(Evidence::Seen, f64::from(*side_m), speaker);
                     } else if *views >= LEAST_VIEWS {
-                        belief.hear(Evidence::Missed, f64::from(*side_m));
+                        belief.hear(Evidence::Missed, f64::from(*side_m), speaker);
                     }
                 }
             }
@@ -74,10 +75,16 @@ impl Fusion<'_> {
             lanes.extend(pieces.map(|(stretch, knots)| self.fused_lane(index, stretch, &points[knots], &record)));
         }
         lanes.sort_by_key(|lane| lane.id);
+        let changes = self.changes(&beliefs);
         let drives = self.drives.iter().zip(&self.placed).zip(self.corrections).map(|((drive, placed), correction)| {
             FusedDrive { drive: drive.contribution.drive, correction: placed.then_some(correction) }
         });
-        FusedMap { lanes, drives: drives.collect(), folded_drives: u32::try_from(base.drives()).unwrap_or(u32::MAX) }
+        FusedMap {
+            lanes,
+            changes,
+            drives: drives.collect(),
+            folded_drives: u32::try_from(base.drives()).unwrap_or(u32::MAX),
+        }
     }
 
     fn points_of(&self, index: usize, beliefs: &[Belief]) -> Vec<FusedPoint> {
@@ -91,6 +98,7 @@ impl Fusion<'_> {
                 height_sigma_m: mean.height_information.max(1e-6).powf(-0.5),
                 drives: line.knots[knot].drives(),
                 existence: beliefs[knot].probability,
+                confirmed: beliefs[knot].confirmed.unwrap_or_default(),
             }
         });
         points.collect()

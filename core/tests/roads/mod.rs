@@ -129,7 +129,7 @@ impl<'a> Survey<'a> {
                 amplitude * (0.7 * phases[0] + 0.7 * phases[1] * (station_m / 20.0 + phases[2] * 3.0).sin())
             };
             let points =
-                (0..).map(|step| 3.0 * f64::from(step)).take_while(|station_m| *station_m <= self.road.length_m);
+                (4..).map(|step| 3.0 * f64::from(step)).take_while(|station_m| *station_m <= self.road.length_m);
             let points = points.map(|station_m| {
                 let own = to_own(self.road.place(station_m, line_m + error(station_m)), station_m);
                 ControlPoint {

@@ -320,6 +320,7 @@ mod tests {
                 height_sigma_m: 0.2,
                 drives: 2,
                 existence: 0.9,
+                confirmed: TimestampNs(2),
             }
         });
         FusedLane {

@@ -1,0 +1,156 @@
+//! Change: what is on the road now that was not, and what was and is no more.
+//!
+//! Every knot of every line has a belief that it is there ([`persistence`](super::persistence)). Where the belief turns, neighbouring knots
+//! that turned with the same few drives are one event. A stretch that went beside one that came, at most [`MOVED_M`]
+//! across, was moved. The probability of an event is the mean of its knots'.
+//!
+//! Not guaranteed: a move by less than about 0.7 m, which matching takes for the error of a drive, and a new category on
+//! a part of a line, which a drive's own map does not tell.
+
+use nalgebra::Point3;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    contribution::DriveId,
+    fusion::Fusion,
+    line::{FusedLaneId, Lines},
+    persistence::{Belief, Speaker, Turn},
+};
+use crate::frame::TimestampNs;
+
+/// What happened to a stretch of road.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum ChangeKind {
+    /// A line is there, where drives before saw none.
+    Appeared,
+    /// A line is there no more.
+    Vanished,
+    /// A line lies elsewhere.
+    Moved {
+        /// How far, metres.
+        by_m: f64,
+    },
+}
+
+/// Something that happened to a stretch of road.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MapChange {
+    /// What.
+    pub kind: ChangeKind,
+    /// The line that it happened to; where it moved, the new one.
+    pub lane: FusedLaneId,
+    /// The stretch, shared frame, metres: where the line is now, or was.
+    pub points: Vec<Point3<f64>>,
+    /// Start of the drive with which it came to be believed.
+    pub noticed: TimestampNs,
+    /// That drive.
+    pub noticed_by: DriveId,
+    /// Probability that it happened.
+    pub probability: f64,
+}
+
+/// Farthest distance between the old and the new place of a line that was moved, metres.
+const MOVED_M: f64 = 2.5;
+/// Least number of knots of an event.
+const LEAST_KNOTS: usize = 2;
+/// Knots that may be missing from an event without cutting it in two.
+const BRIDGED_KNOTS: usize = 2;
+
+/// A run of knots of one line that turned alike.
+struct Stretch {
+    line: usize,
+    turn: Turn,
+    first: usize,
+    last: usize,
+    noticed: Speaker,
+    probability_sum: f64,
+    knots: usize,
+}
+
+impl Fusion<'_> {
+    /// Every change that is believed, in the order in which they came to be.
+    pub(super) fn changes(&self, beliefs: &[Vec<Belief>]) -> Vec<MapChange> {
+        let mut stretches = Vec::new();
+        for (line, beliefs) in beliefs.iter().enumerate() {
+            stretches.extend(stretches_of(line, beliefs));
+        }
+        stretches.retain(|stretch| stretch.knots >= LEAST_KNOTS);
+        let mut changes = events(&self.lines, &stretches);
+        changes.sort_by_key(|change| (change.noticed, change.noticed_by, change.lane));
+        changes
+    }
+}
+
+fn stretches_of(line: usize, beliefs: &[Belief]) -> Vec<Stretch> {
+    let mut stretches: Vec<Stretch> = Vec::new();
+    for (knot, belief) in beliefs.iter().enumerate() {
+        let Some((turn, noticed)) = belief.change else { continue };
+        let probability = if turn == Turn::Came { belief.probability } else { 1.0 - belief.probability };
+        match stretches.last_mut() {
+            Some(open) if open.turn == turn && knot - open.last <= BRIDGED_KNOTS + 1 => {
+                open.last = knot;
+                open.noticed = open.noticed.max(noticed);
+                open.probability_sum += probability;
+                open.knots += 1;
+            }
+            _ => stretches.push(Stretch {
+                line,
+                turn,
+                first: knot,
+                last: knot,
+                noticed,
+                probability_sum: probability,
+                knots: 1,
+            }),
+        }
+    }
+    stretches
+}
+
+/// Events of stretches; one that went beside one that came is one event.
+fn events(lines: &Lines, stretches: &[Stretch]) -> Vec<MapChange> {
+    let came: Vec<&Stretch> = stretches.iter().filter(|stretch| stretch.turn == Turn::Came).collect();
+    let went: Vec<&Stretch> = stretches.iter().filter(|stretch| stretch.turn == Turn::Went).collect();
+    let mut moved_from = vec![false; went.len()];
+    let mut changes = Vec::new();
+    for stretch in came {
+        let beside = went.iter().enumerate().filter(|(index, _)| !moved_from[*index]);
+        let beside = beside.filter_map(|(index, old)| Some((index, distance_m(lines, stretch, old)?)));
+        let nearest = beside.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, by_m)| *by_m <= MOVED_M);
+        changes.push(match nearest {
+            Some((index, by_m)) => {
+                moved_from[index] = true;
+                change(lines, stretch, ChangeKind::Moved { by_m })
+            }
+            None => change(lines, stretch, ChangeKind::Appeared),
+        });
+    }
+    let gone = went.iter().zip(&moved_from).filter(|(_, moved)| !**moved);
+    changes.extend(gone.map(|(stretch, _)| change(lines, stretch, ChangeKind::Vanished)));
+    changes
+}
+
+fn change(lines: &Lines, stretch: &Stretch, kind: ChangeKind) -> MapChange {
+    let line = &lines.lines[stretch.line];
+    let (noticed, noticed_by) = stretch.noticed;
+    MapChange {
+        kind,
+        lane: line.id,
+        points: line.points[stretch.first..=stretch.last].to_vec(),
+        noticed,
+        noticed_by,
+        probability: stretch.probability_sum / stretch.knots as f64,
+    }
+}
+
+/// Mean distance of the knots of one stretch from the nearest of another; `None` where less than half have one near.
+fn distance_m(lines: &Lines, a: &Stretch, b: &Stretch) -> Option<f64> {
+    let points = |stretch: &Stretch| &lines.lines[stretch.line].points[stretch.first..=stretch.last];
+    let nearest = points(a).iter().map(|point| {
+        let to_b = points(b).iter().map(|other| (other - point).xy().norm());
+        to_b.fold(f64::INFINITY, f64::min)
+    });
+    // Knots of the two lie beside each other to within half a chord.
+    let near: Vec<f64> = nearest.filter(|distance| *distance <= MOVED_M + 1.5).collect();
+    (2 * near.len() >= a.knots).then(|| near.iter().sum::<f64>() / near.len() as f64)
+}

@@ -206,46 +206,59 @@ impl EdgeLines {
         let mut painted = Self { carriageway: Vec::new(), ramps: vec![Vec::new(); ramps.len()] };
         // The edge line being drawn: what it has so far, where it goes on, and the ramp from which it came.
         let (mut edge, mut from, mut came_from): (Vec<Point2<f64>>, usize, Option<usize>) = (Vec::new(), 0, None);
+        // That which goes round a rest area, until it is back.
+        let mut round: Option<Vec<Point2<f64>>> = None;
         for (index, ramp) in ramps.iter().enumerate() {
             let opened = came_from.map(|before: usize| ramps[before].at);
             let opens = ramp.leaves.then_some(ramp.at);
             let widened = |k: usize| edge_m() - LANE_M * openness(k, opened, opens);
             edge.extend(offset(reference, from..ramp.at + 1, widened));
-            let outer = offset(&ramp.reference, 1..ramp.reference.len(), |_| -LANE_M);
-            let inner = offset(&ramp.reference, 0..ramp.reference.len(), |_| 0.0);
-            let apart = apart_from(reference, &inner);
-            let dashes = if ramp.leaves {
-                let dashes = opening(ramp.at - crate::count_of(EXTRA_M), ramp.at, true);
-                edge.extend(outer);
-                let line = network.add_line(Category::WhiteSolid, &edge);
-                painted.carriageway.push(line);
-                painted.ramps[index].push(line);
-                if let Some(before) = came_from {
-                    painted.ramps[before].push(line);
+            let last = ramp.reference.len() - 1;
+            let outer = |points| offset(&ramp.reference, points, |_| -LANE_M);
+            let (at, extra) = (ramp.at, crate::count_of(EXTRA_M));
+            let dashes = if ramp.leaves { opening(at - extra, at, true) } else { opening(at, at + extra, false) };
+            let done = std::mem::take(&mut edge);
+            match (ramp.leaves, ramp.junction) {
+                (true, None) => round = Some([done, outer(1..last)].concat()),
+                (true, Some(_)) => {
+                    let line = painted.edge(network, &[done, outer(1..last + 1)].concat(), came_from, ramps);
+                    painted.ramps[index].push(line);
                 }
-                (edge, from, came_from) = (Vec::new(), ramp.at, None);
-                dashes
-            } else {
-                let dashes = opening(ramp.at, ramp.at + crate::count_of(EXTRA_M), false);
-                painted.carriageway.push(network.add_line(Category::WhiteSolid, &edge));
-                edge = offset(&ramp.reference, 0..ramp.reference.len() - 1, |_| -LANE_M);
-                (from, came_from) = (ramp.at, Some(index));
-                dashes
-            };
+                (false, _) => {
+                    painted.edge(network, &done, came_from, ramps);
+                    edge = round.take().unwrap_or_else(|| outer(0..last));
+                }
+            }
+            (from, came_from) = (at, (!ramp.leaves).then_some(index));
             painted.carriageway.push(network.add_line(Category::WhiteDashed, &offset(reference, dashes, |_| edge_m())));
             // A rest area's one road is painted with its first ramp.
             if ramp.junction.is_some() || ramp.leaves {
+                let inner = offset(&ramp.reference, 0..last + 1, |_| 0.0);
+                let apart = apart_from(reference, &inner);
                 painted.ramps[index].push(network.add_line(Category::YellowSolid, &inner[apart]));
             }
         }
         let opened = came_from.map(|before| ramps[before].at);
         edge.extend(offset(reference, from..reference.len(), |k| edge_m() - LANE_M * openness(k, opened, None)));
-        let line = network.add_line(Category::WhiteSolid, &edge);
-        painted.carriageway.push(line);
-        if let Some(before) = came_from {
-            painted.ramps[before].push(line);
-        }
+        painted.edge(network, &edge, came_from, ramps);
         painted
+    }
+
+    /// Adds an edge line of the carriageway, and of the ramp from which it came.
+    fn edge(
+        &mut self,
+        network: &mut RoadNetwork,
+        places: &[Point2<f64>],
+        came_from: Option<usize>,
+        ramps: &[Ramp],
+    ) -> RoadLineId {
+        let line = network.add_line(Category::WhiteSolid, places);
+        self.carriageway.push(line);
+        if let Some(ramp) = came_from {
+            // A rest area's one road is the link of its first ramp.
+            self.ramps[if ramps[ramp].junction.is_some() { ramp } else { ramp - 1 }].push(line);
+        }
+        line
     }
 }
 

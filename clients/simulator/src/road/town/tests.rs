@@ -1,6 +1,6 @@
 //! Promises of towns.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::*;
 use crate::{
@@ -77,4 +77,48 @@ fn the_two_lines_of_a_double_line_lie_a_quarter_of_a_metre_apart() {
         }
     }
     assert!(pairs >= 20);
+}
+
+#[test]
+fn no_stretch_of_a_line_is_painted_twice() {
+    for network in towns().iter().chain([&TownPlan::square_km(3.2).build(0.03, Seed(1))]) {
+        let mut lines_at: BTreeMap<[i64; 2], BTreeSet<u32>> = BTreeMap::new();
+        for line in network.lines() {
+            for point in &line.points {
+                let cell = [point.x, point.y].map(|value| (value * 20.0).round().to_string().parse().unwrap());
+                lines_at.entry(cell).or_default().insert(line.id.0);
+            }
+        }
+        let mut shared: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+        for lines in lines_at.values().filter(|lines| lines.len() > 1) {
+            let pair = (lines.first().copied().unwrap(), lines.last().copied().unwrap());
+            *shared.entry(pair).or_default() += 1;
+        }
+        assert!(shared.values().all(|points| *points < 6), "{shared:?}");
+    }
+}
+
+#[test]
+fn every_road_has_a_line_on_each_of_its_sides() {
+    for network in towns() {
+        for link in network.links() {
+            let middle = link.reference.len() / 2;
+            let heading_rad = link.reference.headings_rad()[middle];
+            let left = nalgebra::Vector2::new(-heading_rad.sin(), heading_rad.cos());
+            let place = link.reference.points()[middle];
+            let width_m = link.lane_width_m * f64::from(link.carriageway.forward_lanes());
+            let reach_m = width_m + link.lane_width_m + 1.5;
+            let sides: Vec<f64> = link
+                .lines
+                .iter()
+                .flat_map(|line| &network.line(*line).points)
+                .map(|point| point.xy() - place)
+                .filter(|offset| offset.norm() < reach_m && offset.perp(&left).abs() < 1.1)
+                .map(|offset| offset.dot(&left))
+                .collect();
+            let has = |from_m: f64, to_m: f64| sides.iter().any(|side_m| (from_m..to_m).contains(side_m));
+            assert!(has(-reach_m, 0.1 - width_m), "no right edge at {place}: {:?} {sides:?}", link.kind);
+            assert!(has(-0.7, reach_m), "no line on the left at {place}: {:?}", link.kind);
+        }
+    }
 }

@@ -1,7 +1,7 @@
 //! The base: what is left of drives that were folded.
 //!
-//! Its lines keep the sum of the information of all of them at each knot, so that the mean of base and a younger drive is the
-//! mean of all. In alignment it is one more drive: it may be shifted as a whole, held where it is by the GNSS biases of its
+//! Its lines keep the sum of the information of all of them at each knot, less what the final alignment costs: so the mean of
+//! base and younger drives is nearly that of all. In alignment it is one more drive: it may be shifted as a whole, held where it is by the GNSS biases of its
 //! drives, whose mean has the variance `s_b^2 / n`; and it is turned by nothing.
 
 use nalgebra::Point3;
@@ -14,6 +14,10 @@ use super::{
     params::FleetParams,
     prepared::{Restraints, SharedFix, normal_of},
 };
+
+/// What the lines of a base are off by together, over tens of metres: the alignment that they were folded with is final,
+/// and no longer gets better with younger drives. Metres.
+const SHAPE_SIGMA_M: f64 = 0.06;
 
 /// Drives that were folded.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -59,6 +63,7 @@ impl Base {
                     lane: 0,
                     map: knot.place,
                     arc_m: 0.0,
+                    shared: knot.place,
                     lateral_variance_m2: knot.lateral_variance_m2,
                     height_variance_m2: knot.height_variance_m2,
                     share: 1.0,
@@ -105,11 +110,11 @@ impl Fusion<'_> {
         for (index, (line, beliefs)) in self.lines.lines.iter().zip(&beliefs).enumerate() {
             let knots = (0..line.points.len()).map(|knot| {
                 let normal = normal_of(&line.tangent(knot));
-                let mean = line.mean_offset(knot, &normal, &self.corrections, self.params);
+                let mean = line.mean_offset(knot, &normal, self.params);
                 BaseKnot {
                     place: line.points[knot],
-                    lateral_variance_m2: 1.0 / mean.across_information.max(1e-6),
-                    height_variance_m2: 1.0 / mean.height_information.max(1e-6),
+                    lateral_variance_m2: 1.0 / mean.across_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
+                    height_variance_m2: 1.0 / mean.height_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
                     record: KnotRecord { drives: line.knots[knot].drives(), belief: beliefs[knot] },
                 }
             });

@@ -207,7 +207,7 @@ impl<'a> Fusion<'a> {
     fn grow(&mut self, drive: usize, number: usize, pass: &PreparedPass<'_>, pieces: &mut Pieces) {
         let contribution = self.drives[drive].contribution;
         let growing = Growing { contribution, pass, drive, number, params: self.params };
-        growing.add_to(&mut self.lines, &self.corrections, pieces);
+        growing.add_to(&mut self.lines, &self.corrections[drive], pieces);
     }
 
     /// Solves for one drive's correction while the lines stay.
@@ -293,7 +293,7 @@ impl<'a> Fusion<'a> {
             self.grow(drive, number, pass, &mut pieces);
         }
         for line in &mut self.lines.lines {
-            line.settle(&self.corrections, self.params);
+            line.settle(self.params);
         }
         self.lines.index();
     }
@@ -341,8 +341,7 @@ impl<'a> Fusion<'a> {
             for (knot, at) in line.knots.iter().enumerate().filter(|(_, at)| at.witnesses.len() >= 3) {
                 let normal = normal_of(&line.tangent(knot));
                 for witness in at.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
-                    let place = self.corrections[witness.drive].apply(&witness.map, witness.arc_m);
-                    residuals[witness.drive].push((place - line.points[knot]).xy().dot(&normal).abs());
+                    residuals[witness.drive].push((witness.shared - line.points[knot]).xy().dot(&normal).abs());
                 }
             }
         }

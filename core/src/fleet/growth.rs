@@ -29,26 +29,31 @@ pub(super) struct Growing<'a> {
     pub(super) params: &'a FleetParams,
 }
 
+/// Passes after which the lines are no longer settled after each.
+const SETTLED_EACH: usize = 6;
+
 /// How many lines each lane of each drive has begun.
 pub(super) type Pieces = BTreeMap<(usize, LaneId), u32>;
 
 impl Growing<'_> {
     /// Adds the pass to the lines.
-    pub(super) fn add_to(&self, lines: &mut Lines, corrections: &[Correction], pieces: &mut Pieces) {
-        let correction = &corrections[self.drive];
+    pub(super) fn add_to(&self, lines: &mut Lines, correction: &Correction, pieces: &mut Pieces) {
         let matched = match_lanes(&self.pass.lanes, correction, lines, self.params);
         let before = lines.lines.len();
         let mut touched = BTreeSet::new();
         let mut changed = false;
         for (lane, runs) in matched.iter().enumerate() {
             for run in runs {
-                self.testify(lines, lane, run);
+                self.testify(lines, correction, lane, run);
                 touched.insert(run.line);
             }
             changed |= self.add_rest(lines, correction, lane, runs, pieces);
         }
-        for line in touched.into_iter().filter(|line| *line < before) {
-            lines.lines[line].settle(corrections, self.params);
+        // A mean of many is moved little by one more: it is made anew now and then.
+        if self.number < SETTLED_EACH || self.number.is_multiple_of(SETTLED_EACH) {
+            for line in touched.into_iter().filter(|line| *line < before) {
+                lines.lines[line].settle(self.params);
+            }
         }
         if changed {
             lines.index();
@@ -56,7 +61,7 @@ impl Growing<'_> {
     }
 
     /// Witnesses of a run at the knots of its line.
-    fn testify(&self, lines: &mut Lines, lane_index: usize, run: &Run) {
+    fn testify(&self, lines: &mut Lines, correction: &Correction, lane_index: usize, run: &Run) {
         let lane = &self.pass.lanes[lane_index];
         let line = &mut lines.lines[run.line];
         let first_sample = *run.samples.start();
@@ -69,7 +74,10 @@ impl Growing<'_> {
             while (knot as f64) < high && knot < line.points.len() {
                 let share = (knot as f64 - pair[0]) / (pair[1] - pair[0]);
                 let parameter = from.parameter + (to.parameter - from.parameter) * share;
-                line.testify(knot, witness_at(self.witness(lane_index), lane, first_sample + step, parameter));
+                line.testify(
+                    knot,
+                    witness_at(self.witness(lane_index), lane, correction, first_sample + step, parameter),
+                );
                 knot += 1;
             }
         }
@@ -136,7 +144,7 @@ impl Growing<'_> {
             if offset.norm() < 0.9 * self.params.line_knot_m || offset.dot(&direction) <= 0.0 {
                 continue;
             }
-            let witness = witness_at(self.witness(lane_index), lane, sample, near.parameter);
+            let witness = witness_at(self.witness(lane_index), lane, correction, sample, near.parameter);
             let knot = Knot { witnesses: vec![witness], ..Knot::default() };
             if at_tail { line.push(place, knot) } else { line.push_front(place, knot) }
         }
@@ -162,7 +170,7 @@ impl Growing<'_> {
             let place = correction.apply(&near.map, near.arc_m);
             let far = |last| nalgebra::distance(last, &place) >= 0.9 * self.params.line_knot_m;
             if line.points.last().is_none_or(far) {
-                let witness = witness_at(self.witness(lane_index), lane, sample, near.parameter);
+                let witness = witness_at(self.witness(lane_index), lane, correction, sample, near.parameter);
                 line.push(place, Knot { witnesses: vec![witness], ..Knot::default() });
             }
         }

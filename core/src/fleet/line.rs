@@ -92,6 +92,8 @@ pub(super) struct Witness {
     /// Map frame of the drive.
     pub(super) map: Point3<f64>,
     pub(super) arc_m: f64,
+    /// The same place by the drive's correction.
+    pub(super) shared: Point3<f64>,
     pub(super) lateral_variance_m2: f64,
     pub(super) height_variance_m2: f64,
     /// 1 within the drive's lane, less near its ends.
@@ -228,26 +230,20 @@ impl Line {
     }
 
     /// Puts every knot to the mean of its witnesses, across the line and in height.
-    pub(super) fn settle(&mut self, corrections: &[Correction], params: &FleetParams) {
+    pub(super) fn settle(&mut self, params: &FleetParams) {
         let moved = (0..self.points.len()).map(|knot| {
             let normal = normal_of(&self.tangent(knot));
-            let mean = self.mean_offset(knot, &normal, corrections, params);
+            let mean = self.mean_offset(knot, &normal, params);
             self.points[knot] + Vector3::new(normal.x * mean.across_m, normal.y * mean.across_m, mean.height_m)
         });
         self.points = moved.collect();
     }
 
     /// Where the witnesses of a knot put it, from where it is.
-    pub(super) fn mean_offset(
-        &self,
-        knot: usize,
-        normal: &Vector2<f64>,
-        corrections: &[Correction],
-        params: &FleetParams,
-    ) -> MeanOffset {
+    pub(super) fn mean_offset(&self, knot: usize, normal: &Vector2<f64>, params: &FleetParams) -> MeanOffset {
         let place = self.points[knot];
         let offsets = self.knots[knot].witnesses.iter().map(|witness| {
-            let offset = corrections[witness.drive].apply(&witness.map, witness.arc_m) - place;
+            let offset = witness.shared - place;
             (offset.xy().dot(normal), offset.z, witness)
         });
         let offsets: Vec<(f64, f64, &Witness)> = offsets.collect();
@@ -363,6 +359,7 @@ impl Lines {
 pub(super) fn witness_at(
     (drive, pass, lane_index): (usize, usize, usize),
     lane: &PreparedLane<'_>,
+    correction: &Correction,
     sample: usize,
     parameter: f64,
 ) -> Witness {
@@ -376,6 +373,7 @@ pub(super) fn witness_at(
         lane: lane_index,
         map,
         arc_m: near.arc_m,
+        shared: correction.apply(&map, near.arc_m),
         lateral_variance_m2: near.lateral_variance_m2,
         height_variance_m2: near.height_variance_m2,
         share: (to_end_m / TAPER_M).clamp(0.05, 1.0),

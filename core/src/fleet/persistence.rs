@@ -63,6 +63,8 @@ pub(super) struct Belief {
     pub(super) probability: f64,
     /// Passes that saw it.
     seen: u32,
+    /// Passes that missed it since.
+    missed: u32,
     /// Passes that missed it before any saw it.
     missed_before: u32,
     /// Whether it was believed to be there, and not since to be gone.
@@ -85,7 +87,7 @@ pub(super) enum Turn {
 impl Default for Belief {
     /// Before any drive.
     fn default() -> Self {
-        Self { probability: 0.5, seen: 0, missed_before: 0, stands: false, confirmed: None, change: None }
+        Self { probability: 0.5, seen: 0, missed: 0, missed_before: 0, stands: false, confirmed: None, change: None }
     }
 }
 
@@ -93,7 +95,7 @@ impl Belief {
     /// Takes what the next drive says.
     pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64, speaker: Speaker) {
         let coming = self.probability * (1.0 - HAZARD) + (1.0 - self.probability) * HAZARD;
-        let seen = if to_the_side_m < FAR_M { SEEN_NEAR } else { SEEN_FAR };
+        let seen = self.chance_of_sight(if to_the_side_m < FAR_M { SEEN_NEAR } else { SEEN_FAR });
         let (there, not_there) = match evidence {
             Evidence::Seen => (seen, SEEN_GHOST),
             Evidence::Missed => (1.0 - seen, 1.0 - SEEN_GHOST),
@@ -105,9 +107,21 @@ impl Belief {
                 self.confirmed = Some(speaker.0);
             }
             Evidence::Missed if self.seen == 0 => self.missed_before += 1,
-            Evidence::Missed => {}
+            Evidence::Missed => self.missed += 1,
         }
         self.turn(speaker);
+    }
+
+    /// Probability that a pass sees it if it is there: by how often it was seen, once several have. A worn line, or one
+    /// across the oncoming lane, is missed often by all.
+    fn chance_of_sight(&self, usual: f64) -> f64 {
+        const KNOWN: u32 = 3;
+        const WEIGHT: f64 = 4.0;
+        if self.seen < KNOWN {
+            return usual;
+        }
+        let passes = f64::from(self.seen + self.missed);
+        ((f64::from(self.seen) + WEIGHT * usual) / (passes + WEIGHT)).clamp(0.25, 0.97)
     }
 
     /// Notes a change, once it is believed. That a line is there is none where nobody passed before.

@@ -59,6 +59,8 @@ const ANOTHER_PLACE_M: f64 = 1.4;
 const LEAST_MARGIN: f64 = 2.0;
 /// Least share of samples that must lie on a line.
 const LEAST_EXPLAINED: f64 = 0.55;
+/// Every how many samples of a lane one votes.
+const STRIDE: usize = 4;
 /// Largest search, steps to each side.
 const MOST_STEPS: usize = 40;
 
@@ -138,7 +140,6 @@ impl Square {
 }
 
 fn votes<'a>(lanes: &'a [PreparedLane<'_>], correction: &Correction, lines: &Lines, reach_m: f64) -> Vec<Vote<'a>> {
-    const STRIDE: usize = 2;
     let mut votes = Vec::new();
     for lane in lanes {
         for sample in lane.samples.iter().step_by(STRIDE) {
@@ -188,7 +189,7 @@ fn likelihoods(votes: &[Vote<'_>], square: Square, prior_sigma_m: f64, params: &
     /// Step of the table of a sample's support, metres.
     const FINE_M: f64 = 0.125;
     let windows = votes.iter().map(|vote| vote.window).max().unwrap_or(0) + 1;
-    let share = (2.0 * params.sample_m / params.lane_correlation_m).min(1.0);
+    let share = (STRIDE as f64 * params.sample_m / params.lane_correlation_m).min(1.0);
     let shifts: Vec<Vector2<f64>> = (0..square.count()).map(|state| square.shift(state)).collect();
     let farthest_m = square.side as f64 * STEP_M * 2.0_f64.sqrt();
     let half = count_of(farthest_m / FINE_M) + 1;

@@ -91,7 +91,7 @@ impl Fusion<'_> {
         let line = &self.lines.lines[index];
         let points = (0..line.points.len()).map(|knot| {
             let normal = normal_of(&line.tangent(knot));
-            let mean = line.mean_offset(knot, &normal, &self.corrections, self.params);
+            let mean = line.mean_offset(knot, &normal, self.params);
             FusedPoint {
                 position: line.points[knot],
                 lateral_sigma_m: mean.across_information.max(1e-6).powf(-0.5),

@@ -137,6 +137,32 @@ async fn any_order_of_upload_and_any_duplication_gives_the_same_map() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn of_more_drives_than_a_cell_keeps_the_youngest_count_in_any_order_of_upload() {
+    let drives = along_a_road(12, 3, 120.0, false);
+    let key = tempfile::tempdir().unwrap();
+    let mut maps = Vec::new();
+    for order in [vec![0, 1, 2], vec![2, 1, 0], vec![1, 2]] {
+        let folder = tempfile::tempdir().unwrap();
+        let config = ServerConfig {
+            privacy_key_file: key.path().join("privacy.key"),
+            max_contributions_per_cell: 2,
+            ..servers::config(folder.path())
+        };
+        let server = Server::start(config).await.unwrap();
+        for index in order {
+            drives[index].upload_whole(&server.url()).await;
+        }
+        settled(&server).await;
+        assert_eq!(json(&format!("{}/cells", server.url())).await["cells"][0]["drives"], 2);
+        maps.push(cell_maps(&server.url()).await.remove(0).lanes);
+        server.shutdown().await;
+    }
+    assert!(!maps[0].is_empty());
+    assert_eq!(maps[0], maps[2]);
+    assert_eq!(maps[1], maps[2]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_kill_loses_no_cell_and_a_clean_one_is_not_fused_again() {
     let binary = env!("CARGO_BIN_EXE_killable-server");
     let drives = along_a_road(3, 2, 200.0, true);

@@ -1,6 +1,7 @@
 //! A thread that cuts drives into contributions and fuses cells, one task after the other.
 
 use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::{PoisonError, atomic::Ordering},
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
@@ -30,9 +31,18 @@ const MOST_VERSIONS: usize = 128;
 /// Pause after a task that could not be done.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);
 
+/// Pause after a task in which this program failed.
+const PAUSE_AFTER_FAULT: Duration = Duration::from_mins(1);
+
 pub(super) struct Worker {
     fuser: Fuser,
     store: CellStore,
+}
+
+/// Why a task is not done.
+enum Failure {
+    Store(JournalError),
+    Panic,
 }
 
 /// A cell as it was fused.
@@ -56,21 +66,23 @@ impl Worker {
                 Taken::Contribute(offer) => Task::Contribute(offer.session),
                 Taken::Fuse(cell) => Task::Fuse(*cell),
             };
-            let outcome = match &taken {
-                Taken::Contribute(offer) => self.contribute(offer),
-                Taken::Fuse(cell) => self.fuse(*cell),
-            };
+            let outcome = self.attempt(&taken);
             let mut queue = self.fuser.queue();
             match outcome {
                 Ok(()) => queue.finish(task, Instant::now()),
-                Err(error) if self.fuser.is_stopping() => {
+                Err(Failure::Store(error)) if self.fuser.is_stopping() => {
                     // The next start finds out what is missing.
                     tracing::warn!(%error, "the shared map could not be brought up to date");
                     queue.finish(task, Instant::now());
                 }
-                Err(error) => {
-                    tracing::error!(%error, "the shared map cannot be brought up to date, and is tried again");
+                Err(Failure::Store(error)) => {
+                    tracing::warn!(%error, "the shared map cannot be brought up to date, and is tried again");
                     queue.retry(taken, Instant::now(), RETRY_PAUSE);
+                }
+                Err(Failure::Panic) if self.fuser.is_stopping() => queue.finish(task, Instant::now()),
+                Err(Failure::Panic) => {
+                    tracing::error!(?task, "a fault of this program: the task is tried again, the others go on");
+                    queue.retry(taken, Instant::now(), PAUSE_AFTER_FAULT);
                 }
             }
             self.fuser.tell_dirty(&queue);
@@ -78,6 +90,18 @@ impl Worker {
             self.fuser.shared.woken.notify_all();
             self.fuser.shared.done.send_modify(|count| *count += 1);
             self.rest(started.elapsed());
+        }
+    }
+
+    /// Does a task. A panic in it, which is a fault of this program, ends the task and not the thread.
+    fn attempt(&self, taken: &Taken) -> Result<(), Failure> {
+        let attempt = AssertUnwindSafe(|| match taken {
+            Taken::Contribute(offer) => self.contribute(offer),
+            Taken::Fuse(cell) => self.fuse(*cell),
+        });
+        match catch_unwind(attempt) {
+            Ok(outcome) => outcome.map_err(Failure::Store),
+            Err(_) => Err(Failure::Panic),
         }
     }
 

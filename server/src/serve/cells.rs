@@ -203,7 +203,7 @@ fn entry(cell: CellId, record: &CellRecord, map: &SharedMap) -> Entry {
         kept_apart: record.kept_apart.len(),
         lanes: record.lanes,
         line_km: rounded(record.line_m / 1e3, 1e3),
-        median_lateral_sigma_m: (record.lanes > 0).then_some(record.median_lateral_sigma_m),
+        median_lateral_sigma_m: (record.lanes > 0).then(|| rounded(record.median_lateral_sigma_m, 1e3)),
         fused_at: rfc3339(TimestampNs(fused_at)),
         fused_in_s: record.fused_in_ms as f64 / 1e3,
         bbox: of_cell(cell).to_array(),

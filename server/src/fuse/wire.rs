@@ -149,7 +149,12 @@ fn lane(JoinedPiece { piece, begins_at, ends_at }: &JoinedPiece) -> v1::FusedLan
         last_seen_unix_ns: piece.last_seen.0,
         begins_at: begins_at.as_ref().map(border),
         ends_at: ends_at.as_ref().map(border),
+        confirmed_after_s: points.iter().map(|point| whole_seconds(piece.first_seen, point.confirmed)).collect(),
     }
+}
+
+fn whole_seconds(from: TimestampNs, to: TimestampNs) -> i64 {
+    to.0.saturating_sub(from.0).div_euclid(1_000_000_000)
 }
 
 fn border(join: &Join) -> v1::LaneBorder {

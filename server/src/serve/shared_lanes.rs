@@ -55,6 +55,8 @@ struct SharedLaneProperties {
     first_seen: String,
     /// Time of the last frame that saw it, RFC 3339.
     last_seen: String,
+    /// Start of the last drive that saw its stalest control point, RFC 3339.
+    confirmed: String,
     /// The feature on the other side of the border from which the line comes.
     #[serde(skip_serializing_if = "Option::is_none")]
     comes_from: Option<String>,
@@ -133,6 +135,9 @@ fn properties(map: &v1::CellMap, lane: &v1::FusedLane) -> SharedLaneProperties {
         height_sigma_m: median(&lane.height_sigma_mm) / 1e3,
         first_seen: rfc3339(TimestampNs(lane.first_seen_unix_ns)),
         last_seen: rfc3339(TimestampNs(lane.last_seen_unix_ns)),
+        confirmed: rfc3339(TimestampNs(lane.first_seen_unix_ns.saturating_add(
+            lane.confirmed_after_s.iter().min().map_or(0, |seconds| seconds.saturating_mul(1_000_000_000)),
+        ))),
         comes_from: beyond(&lane.begins_at),
         continues_in: beyond(&lane.ends_at),
     }

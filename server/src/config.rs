@@ -189,7 +189,7 @@ impl Default for ServerConfig {
             max_connections: 8192,
             max_streams_per_connection: 1024,
             max_frames_in_flight: 64,
-            max_bytes_in_flight: 64 * 1024 * 1024,
+            max_bytes_in_flight: 256 * 1024 * 1024,
             reorder_window_frames: 32,
             reorder_wait_ms: 200,
             max_frames_per_commit: 2048,

@@ -316,6 +316,19 @@ impl Journal {
         self.store.frames(session, covered, last)
     }
 
+    /// The last frames of a session after `covered`, `most` at most, in the order of their sequence. Reads the disk.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn last_frames(
+        &self,
+        session: SessionId,
+        covered: Option<Sequence>,
+        most: usize,
+    ) -> Result<Vec<JournalFrame>, JournalError> {
+        self.store.get()?.last_frames(session, covered, most)
+    }
+
     /// Bytes that the store takes on the disk.
     ///
     /// # Errors

@@ -138,7 +138,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "N")]
     max_frames_in_flight: Option<usize>,
     /// Bytes of frames of all sessions between the network and the journal, 1 MiB to 1 TiB; vehicles wait where there are more
-    /// [env: LANEMAP_MAX_BYTES_IN_FLIGHT] [default: 67108864]
+    /// [env: LANEMAP_MAX_BYTES_IN_FLIGHT] [default: 268435456]
     #[arg(long, value_name = "BYTES")]
     max_bytes_in_flight: Option<usize>,
     /// Frames of a session that wait for one before them, 0 to 4096; more give it up as missing

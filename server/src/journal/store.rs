@@ -156,8 +156,20 @@ impl Store {
         session: SessionId,
         after: Option<Sequence>,
         last: Sequence,
-    ) -> impl Iterator<Item = fjall::Guard> + use<> {
+    ) -> impl DoubleEndedIterator<Item = fjall::Guard> + use<> {
         frame_keys(session, after, last).map(|keys| self.frames.range(keys)).into_iter().flatten()
+    }
+
+    pub(super) fn last_frames(
+        &self,
+        session: SessionId,
+        after: Option<Sequence>,
+        most: usize,
+    ) -> Result<Vec<JournalFrame>, JournalError> {
+        let entries = self.frames_between(session, after, Sequence(u64::MAX)).rev().take(most);
+        let mut frames = entries.map(journal_frame).collect::<Result<Vec<_>, _>>()?;
+        frames.reverse();
+        Ok(frames)
     }
 
     /// Bytes on the disk, the preallocated part of the log included.
@@ -278,6 +290,16 @@ fn close(mut store: Arc<Store>) {
 
 fn record(bytes: &[u8]) -> Result<SessionRecord, JournalError> {
     postcard::from_bytes(bytes).map_err(|error| decode_error("a session's record", &error))
+}
+
+fn journal_frame(entry: fjall::Guard) -> Result<JournalFrame, JournalError> {
+    let (key, value) = entry.into_inner()?;
+    let sequence = key.last_chunk().map(|sequence| Sequence(u64::from_be_bytes(*sequence)));
+    let sequence = sequence.ok_or_else(|| JournalError::Decode {
+        what: "a frame's key".to_owned(),
+        reason: format!("it has {} bytes", key.len()),
+    })?;
+    Ok(JournalFrame { sequence, bytes: value.to_vec() })
 }
 
 fn frame_key(session: SessionId, sequence: Sequence) -> [u8; 16] {

@@ -44,6 +44,9 @@ use backlog::Backlog;
 pub(crate) use command::{Arrival, Attach, Attached, Command, StreamNumber};
 use intake::Early;
 
+/// Acked frames that wait to be mapped are at most one in so many of those that a session may have in flight, when it
+/// takes more.
+const ACKED_SHARE: usize = 4;
 /// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
 
@@ -130,7 +133,7 @@ impl From<ActorError> for Status {
 impl Actor {
     pub(crate) fn new(
         surroundings: Surroundings,
-        Loaded { record, drive, covered, replayed }: Loaded,
+        Loaded { record, drive, covered, replayed, unmapped }: Loaded,
         commands: mpsc::Receiver<Command>,
         actors: TaskTracker,
         mapping_turns: MappingTurns,
@@ -140,6 +143,7 @@ impl Actor {
         // Frames that wait are in flight: with a window of one more, those that they wait for still come through.
         let window = config.reorder_window_frames.min(config.max_frames_in_flight - 1);
         let reorder = Reorder::new(window, config.reorder_wait(), drive.last_sequence());
+        let backlog = Backlog::new(mapping_turns.clone(), &surroundings.journal, record.id, unmapped);
         let mut actor = Self {
             surroundings,
             record,
@@ -147,7 +151,7 @@ impl Actor {
             reorder,
             commands,
             actors,
-            backlog: Backlog::new(mapping_turns.clone()),
+            backlog,
             mapping_turns,
             stream: None,
             unpublished: false,
@@ -183,7 +187,9 @@ impl Actor {
         while let Some(command) = self.commands.recv().await {
             self.take(command).await?;
         }
-        self.save().await?;
+        if !self.stops_before_it_caught_up() {
+            self.save().await?;
+        }
         self.publish();
         self.surroundings.sessions.fall_asleep(self.record.id, state_without_stream(&self.record));
         Ok(())
@@ -194,21 +200,24 @@ impl Actor {
         let gone = self.stream.as_ref().map(|stream| stream.gone.clone());
         let detached = gone.is_none();
         let overdue = self.reorder.deadline();
+        // Acks run ahead of the map, but not far.
+        let most_ahead = self.surroundings.config.max_frames_in_flight.div_ceil(ACKED_SHARE);
+        let takes_more = self.backlog.acked() < most_ahead;
         tokio::select! {
             biased;
-            command = self.commands.recv() => match command {
+            command = self.commands.recv(), if takes_more => match command {
                 Some(command) => self.take(command).await?,
                 None => return Ok(false),
             },
             turn = self.backlog.turn() => {
-                self.map_for(turn).await;
+                self.map_for(turn?).await;
                 if self.backlog.is_empty() && self.snapshot_is_due() {
                     self.save().await?;
                 }
             }
-            () = sleep_until(self.next_publication), if self.unpublished => self.publish(),
+            () = sleep_until(self.next_publication), if self.unpublished && !self.backlog.is_catching_up() => self.publish(),
             () = sleep_until_some(overdue) => self.give_up_overdue().await?,
-            () = cancelled(gone) => self.detach(Ok(())).await,
+            () = cancelled(gone) => self.detach(Ok(())).await?,
             () = sleep_until(self.unload_at), if detached => {
                 // Frames are held no longer than a trip pauses.
                 self.end_trip();
@@ -236,7 +245,7 @@ impl Actor {
                 }
                 Command::Attach(attach) => {
                     self.commit(&mut batch).await?;
-                    self.attach(attach).await;
+                    self.attach(attach).await?;
                 }
                 Command::End { stream } => {
                     if self.is_current(stream) {
@@ -254,7 +263,7 @@ impl Actor {
                     }
                     self.commit(&mut batch).await?;
                     if self.is_current(stream) {
-                        self.detach(with).await;
+                        self.detach(with).await?;
                     }
                 }
             }
@@ -270,13 +279,15 @@ impl Actor {
         self.stream.as_ref().is_some_and(|current| current.number == stream)
     }
 
-    async fn attach(&mut self, attach: Attach) {
+    async fn attach(&mut self, attach: Attach) -> Outcome {
         if self.leaving {
             // Its sender sees that it was dropped, and starts the next actor.
-            return;
+            return Ok(());
         }
-        // Their poses are the stream's before.
-        self.map_all_acked().await;
+        if !self.backlog.is_catching_up() {
+            // The poses of what was acked are the stream's before.
+            self.map_all_acked().await?;
+        }
         if let Some(before) = self.stream.take() {
             before.outbox.finish(Err(Error::Superseded.into()));
         }
@@ -293,10 +304,13 @@ impl Actor {
             gone: attach.gone,
         });
         self.publish();
+        Ok(())
     }
 
-    async fn detach(&mut self, with: Result<(), Status>) {
-        self.map_all_acked().await;
+    async fn detach(&mut self, with: Result<(), Status>) -> Outcome {
+        if !self.stops_before_it_caught_up() {
+            self.map_all_acked().await?;
+        }
         let stream = self.stream.take();
         self.reorder.restart(self.drive.last_sequence());
         self.unload_at = self.unload_time();
@@ -305,6 +319,7 @@ impl Actor {
         if let Some(stream) = stream {
             stream.outbox.finish(with);
         }
+        Ok(())
     }
 
     /// When a drive without a stream leaves memory. One that holds frames stays until its trip counts as over.
@@ -390,7 +405,7 @@ impl Actor {
         if !self.is_current(stream) {
             return Ok(());
         }
-        self.map_all_acked().await;
+        self.map_all_acked().await?;
         if !self.record.ended {
             // A crash between leaves a drive that the client ends again.
             self.end_trip();
@@ -403,13 +418,12 @@ impl Actor {
         if let Some(stream) = &self.stream {
             stream.outbox.end(v1::SessionEnded { acked_sequence_inclusive });
         }
-        self.detach(Ok(())).await;
-        Ok(())
+        self.detach(Ok(())).await
     }
 
     /// Saves the drive's state where it changed, and trims the journal.
     async fn save(&mut self) -> Outcome {
-        self.map_all_acked().await;
+        self.map_all_acked().await?;
         let Some(covered) = self.drive.covered().filter(|_| self.frames_since_snapshot > 0) else {
             return Ok(());
         };
@@ -437,6 +451,10 @@ impl Actor {
             (None, false) => SessionState::Idle,
         };
         let started = Instant::now();
+        if self.backlog.is_catching_up() {
+            // What is shown of the session is what its last snapshot says, until the map has come farther.
+            return;
+        }
         if self.drive.is_hidden() {
             self.unpublished = false;
             return;

@@ -17,7 +17,7 @@ use super::{
 use crate::{
     fuse::Offer,
     ingest::Refusal,
-    journal::{Journal, JournalError, frame_bytes},
+    journal::{Journal, JournalError, JournalFrame, frame_bytes},
     privacy::{
         TripCut,
         trip_cut::{Passage, TripEnds},
@@ -83,6 +83,24 @@ pub(crate) struct Loaded {
     pub(crate) covered: Option<Sequence>,
     /// Frames after the snapshot, mapped again.
     pub(crate) replayed: u64,
+    /// Frames after those, not mapped yet.
+    pub(crate) unmapped: Option<Unmapped>,
+}
+
+/// Frames that the journal has and the map has not.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Unmapped {
+    /// They come after this one.
+    pub(crate) after: Option<Sequence>,
+    /// The last of them, inclusive.
+    pub(crate) through: Sequence,
+}
+
+impl Unmapped {
+    /// Whether none is left.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.after >= Some(self.through)
+    }
 }
 
 /// How far a drive has come.
@@ -120,7 +138,8 @@ pub(crate) enum DriveError {
 }
 
 impl Loaded {
-    /// Reads a drive from the store: its snapshot, and the frames after it, which are mapped again.
+    /// Reads a drive from the store: its snapshot, and which frames came after it. They are mapped again later, which takes
+    /// a hundred times as long; where frames are held back, they are at once.
     pub(crate) fn read(journal: &Journal, record: SessionRecord) -> Result<Self, JournalError> {
         let damaged = |what: &str, reason: String| JournalError::Decode { what: what.to_owned(), reason };
         let damaged_state = |error: DriveError| damaged("the session's state", error.to_string());
@@ -135,6 +154,13 @@ impl Loaded {
         if let Some(mark) = journal.cut_mark(record.id)? {
             drive.apply_cut_mark(&mark).map_err(damaged_state)?;
         }
+        if !drive.holds_back() {
+            let last = journal.last_frames(record.id, covered, REMEMBERED)?;
+            drive.admit_journaled(&last)?;
+            let through = last.last().map(|frame| frame.sequence);
+            let unmapped = through.map(|through| Unmapped { after: covered, through });
+            return Ok(Self { record, drive, covered, replayed: 0, unmapped });
+        }
         let mut replayed = 0;
         for frame in journal.frames_after(record.id, drive.covered())? {
             let frame = frame?;
@@ -146,7 +172,18 @@ impl Loaded {
                 drive.map(&ready);
             }
         }
-        Ok(Self { record, drive, covered, replayed })
+        Ok(Self { record, drive, covered, replayed, unmapped: None })
+    }
+
+    /// Maps what is not mapped yet.
+    pub(crate) fn caught_up(mut self, journal: &Journal) -> Result<Self, JournalError> {
+        if let Some(Unmapped { after, through }) = self.unmapped.take() {
+            for frame in journal.frames_between(self.record.id, after, through)? {
+                self.drive.map(&frame?);
+                self.replayed += 1;
+            }
+        }
+        Ok(self)
     }
 }
 
@@ -281,6 +318,20 @@ impl Drive {
             self.ends.settled = self.last_sequence();
         }
         held
+    }
+
+    /// Takes the last frames of the journal, which were admitted when they were put there, to be mapped later.
+    fn admit_journaled(&mut self, frames: &[JournalFrame]) -> Result<(), JournalError> {
+        for frame in frames {
+            self.progress.recent.remember(frame.sequence, &frame.bytes);
+        }
+        if let Some(last) = frames.last() {
+            let what = || format!("frame {}", last.sequence.0);
+            let frame = Frame::from_bytes(&last.bytes)
+                .map_err(|error| JournalError::Decode { what: what(), reason: error.to_string() })?;
+            self.progress.last = Some((frame.sequence(), frame.time()));
+        }
+        Ok(())
     }
 
     /// Takes a frame from the journal, which was admitted when it was put there; whether it may be mapped at once.

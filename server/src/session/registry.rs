@@ -328,7 +328,7 @@ impl SessionRegistry {
         // The record may have ended since the slot was filled: the store knows.
         let (session, record) = (record.id, record.clone());
         let loaded = {
-            // It maps frames: more at a time than there are cores would only delay those that stream already.
+            // It reads and may map frames: more at a time than there are cores would only delay those that stream already.
             let _turn = self.shared.loads.acquire().await;
             blocking(move || Loaded::read(&journal, record)).await.map_err(|error| unreadable(session, error))?
         };
@@ -410,7 +410,7 @@ fn summary_of(record: &SessionRecord, bytes: Option<&[u8]>) -> Option<SessionSum
 /// The map of a session that sleeps.
 fn read_published(journal: &Journal, session: SessionId) -> Result<Option<PublishedMap>, JournalError> {
     let Some(record) = journal.record(session)? else { return Ok(None) };
-    let Loaded { record, drive, .. } = Loaded::read(journal, record)?;
+    let Loaded { record, drive, .. } = Loaded::read(journal, record)?.caught_up(journal)?;
     Ok((!drive.is_hidden()).then(|| drive.published(session, state_without_stream(&record))))
 }
 

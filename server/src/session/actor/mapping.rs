@@ -7,8 +7,8 @@ use lanemap_proto::v1::stream_observations_response::Message;
 use tokio::time::Instant;
 
 use super::{
-    Actor,
-    command::Arrival,
+    Actor, Outcome,
+    backlog::Waiting,
     updates::{local_map_update, pose_update},
 };
 use crate::{
@@ -28,30 +28,49 @@ impl Actor {
             tokio::select! {
                 biased;
                 done = &mut work => return done,
-                turn = self.backlog.turn() => self.map_for(turn).await,
+                turn = self.backlog.turn() => match turn {
+                    Ok(turn) => self.map_for(turn).await,
+                    // Whoever asks for the next turn hears of it.
+                    Err(_) => return work.await,
+                },
             }
         }
     }
 
-    /// Maps acked frames for the length of a turn, behind whatever else is ready to run: what reads, journals and acks is.
+    /// Maps frames that wait for the length of a turn, behind whatever else is ready to run: what reads, journals and acks is.
     pub(super) async fn map_for(&mut self, turn: MappingTurn) {
         tokio::task::yield_now().await;
         let began = Instant::now();
         while began.elapsed() < LONGEST_RUN {
-            let Some(Arrival { frame, place, .. }) = self.backlog.pop() else { break };
-            self.map(&frame);
-            drop(place);
+            match self.backlog.pop() {
+                Some(Waiting::Acked(frame, place)) => {
+                    self.map(&frame);
+                    drop(place);
+                }
+                Some(Waiting::Journaled(frame)) => {
+                    self.drive.map(&frame);
+                    self.unpublished = true;
+                    self.frames_since_snapshot += 1;
+                }
+                None => break,
+            }
         }
         drop(turn);
         self.publish_if_due();
     }
 
     /// Maps every frame that was acked.
-    pub(super) async fn map_all_acked(&mut self) {
+    pub(super) async fn map_all_acked(&mut self) -> Outcome {
         while !self.backlog.is_empty() {
-            let turn = self.backlog.turn().await;
+            let turn = self.backlog.turn().await?;
             self.map_for(turn).await;
         }
+        Ok(())
+    }
+
+    /// Whether the service stops before the map has caught up with the journal: the next one goes on with it.
+    pub(super) fn stops_before_it_caught_up(&self) -> bool {
+        self.backlog.is_catching_up() && self.surroundings.shutdown.is_cancelled()
     }
 
     /// Maps frames that were held back when they were acked.

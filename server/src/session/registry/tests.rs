@@ -50,7 +50,7 @@ async fn next(answers: &mut OutboxStream) -> Message {
 #[tokio::test]
 async fn an_ack_does_not_wait_for_mapping_and_no_more_wait_for_it_than_may_be_in_flight() {
     let folder = tempfile::tempdir().unwrap();
-    let config = ServerConfig { max_frames_in_flight: 3, ..ServerConfig::default() };
+    let config = ServerConfig { max_frames_in_flight: 12, ..ServerConfig::default() };
     let registry = registry(folder.path(), config).await;
     let (outbox, mut answers) = Outbox::new();
     let attachment = registry.open(&start(), &outbox).await.unwrap();
@@ -63,19 +63,74 @@ async fn an_ack_does_not_wait_for_mapping_and_no_more_wait_for_it_than_may_be_in
         attachment.send_frame(frame(number), Instant::now()).await.unwrap();
         assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: number }));
     }
-    // Three acked frames are in flight still: the next one is not taken, and the session's queue is not what stops it.
-    let mut fourth = Box::pin(attachment.send_frame(frame(4), Instant::now()));
-    assert!(futures::poll!(fourth.as_mut()).is_pending());
+    // The frames that are acked are in flight still: with nine more the window is full, and the next one is not taken.
+    for number in 4..=12 {
+        attachment.send_frame(frame(number), Instant::now()).await.unwrap();
+    }
+    let mut one_more = Box::pin(attachment.send_frame(frame(13), Instant::now()));
+    assert!(futures::poll!(one_more.as_mut()).is_pending());
     drop(others);
-    fourth.await.unwrap();
+    one_more.await.unwrap();
     let mut poses = Vec::new();
     let mut acked = 3;
-    while poses.len() < 4 {
+    while poses.len() < 13 {
         match next(&mut answers).await {
             Message::Pose(pose) => poses.push(pose.sequence),
             Message::Ack(ack) => acked = ack.acked_sequence_inclusive,
             other => panic!("{other:?}"),
         }
     }
-    assert_eq!((poses, acked), (vec![1, 2, 3, 4], 4));
+    assert_eq!((poses, acked), ((1..=13).collect(), 13));
+}
+
+#[tokio::test]
+async fn a_vehicle_that_comes_back_after_a_crash_is_heard_before_its_frames_are_mapped_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let copy = tempfile::tempdir().unwrap();
+    let session = {
+        let registry = registry(folder.path(), ServerConfig::default()).await;
+        let (outbox, mut answers) = Outbox::new();
+        let attachment = registry.open(&start(), &outbox).await.unwrap();
+        for number in 1..=300 {
+            attachment.send_frame(frame(number), Instant::now()).await.unwrap();
+            while next(&mut answers).await != (Message::Ack(v1::Ack { acked_sequence_inclusive: number })) {}
+        }
+        // What a crash would leave: no snapshot, and every frame in the journal.
+        copy_folder(folder.path(), copy.path());
+        attachment.session
+    };
+    let registry = registry(copy.path(), ServerConfig::default()).await;
+    let mut others = Vec::new();
+    for _ in 0..cores() {
+        others.push(registry.shared.mapping_turns.take().await);
+    }
+    let (outbox, mut answers) = Outbox::new();
+    let attachment = registry.open(&start(), &outbox).await.unwrap();
+    assert_eq!((attachment.session, attachment.at.last), (session, Some(Sequence(300))));
+    for (number, acked) in [(300, 300), (301, 301)] {
+        attachment.send_frame(frame(number), Instant::now()).await.unwrap();
+        assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: acked }));
+    }
+    let sessions = registry.shared.surroundings.sessions.clone();
+    assert!(sessions.list().iter().all(|told| told.version.0 == 0), "a part of the map is shown");
+    drop(others);
+    // Only the frame that came just now has a pose; by then all before it are mapped.
+    let Message::Pose(pose) = next(&mut answers).await else { panic!("no pose") };
+    assert_eq!(pose.sequence, 301);
+    attachment.send(|stream| Command::Detach { stream, with: Ok(()) }).await.unwrap();
+    outbox.finished().await;
+    assert_eq!(sessions.get(&session).unwrap().version.0, 301);
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    for entry in std::fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        let target = to.join(entry.file_name());
+        if entry.file_type().unwrap().is_dir() {
+            std::fs::create_dir_all(&target).unwrap();
+            copy_folder(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).unwrap();
+        }
+    }
 }

@@ -11,6 +11,42 @@
 //! 5. [`base`]: the oldest drives are folded, so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it.
 //! 7. [`line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
+//!
+//! ```
+//! use lanemap_core::{fleet::*, geometry::georeference::{Anchor, Georeference, Wgs84}, *};
+//! use nalgebra::Point3;
+//!
+//! // A drive along two lines, by a receiver that is off by `bias_m` to the north.
+//! let anchor = Anchor::new(Wgs84 { latitude_deg: 48.0, longitude_deg: 11.0, height_m: 500.0 });
+//! let contribution = |number: u64, bias_m: f64| {
+//!     let mut mapper = Mapper::new(Params::preset(Preset::Default), Sensor::default());
+//!     let mut trace = Trace::default();
+//!     let receiver = Georeference { anchor, enu_from_map: Pose::translation(0.0, bias_m, 0.0) };
+//!     for step in 0..60_u32 {
+//!         let line = |y: f64| (1..12).map(|k| Point3::new(5.0 * f64::from(k), y, 0.0)).collect();
+//!         let detection = |category, y| Detection { category, points_vehicle: line(y) };
+//!         let odometry_from_vehicle = Pose::translation(2.0 * f64::from(step), 0.0, 0.0);
+//!         let parts = FrameParts {
+//!             sequence: Sequence(u64::from(step) + 1),
+//!             time: TimestampNs((i64::from(step) + 1_000 * number as i64) * 100_000_000),
+//!             odometry: Odometry { odometry_from_vehicle, motion_covariance: None },
+//!             gnss: Some(receiver.fix_at(&odometry_from_vehicle, 1.5, 2.0)),
+//!             detections: vec![detection(Category::WhiteSolid, 1.8), detection(Category::WhiteDashed, -1.8)],
+//!             occlusions: vec![],
+//!         };
+//!         let frame = Frame::new(parts, &FrameLimits::default()).unwrap();
+//!         let report = mapper.step(&frame);
+//!         trace.observe(&frame, &report.map_from_vehicle);
+//!     }
+//!     trace.contribution(DriveId(number), Sensor::default(), &mapper.lane_map()).unwrap()
+//! };
+//! let drives = [contribution(1, 0.8), contribution(2, -0.6)];
+//! let map = fuse(&drives, &anchor, &FleetParams::default());
+//! assert_eq!(map.lanes.len(), 2);
+//! // The two receivers are believed alike: the map lies between them.
+//! let left = map.lanes.iter().find(|lane| lane.category == Category::WhiteSolid).unwrap();
+//! assert!(left.points.iter().all(|point| (point.position.y - 1.9).abs() < 0.1 && point.drives == 2));
+//! ```
 
 pub mod alignment;
 pub mod base;

@@ -201,8 +201,7 @@ impl Actor {
         let detached = gone.is_none();
         let overdue = self.reorder.deadline();
         // Acks run ahead of the map, but not far.
-        let most_ahead = self.surroundings.config.max_frames_in_flight.div_ceil(ACKED_SHARE);
-        let takes_more = self.backlog.acked() < most_ahead;
+        let takes_more = self.backlog.acked() < self.most_ahead();
         tokio::select! {
             biased;
             command = self.commands.recv(), if takes_more => match command {
@@ -267,12 +266,17 @@ impl Actor {
                     }
                 }
             }
-            let full = taken >= self.surroundings.config.max_frames_in_flight;
+            let full = taken >= self.most_ahead();
             next = if full { None } else { self.commands.try_recv().ok() };
         }
         self.commit(&mut batch).await?;
         self.publish_if_due();
         Ok(())
+    }
+
+    /// Acked frames that may wait to be mapped when more are taken, and frames that are taken together.
+    fn most_ahead(&self) -> usize {
+        self.surroundings.config.max_frames_in_flight.div_ceil(ACKED_SHARE)
     }
 
     fn is_current(&self, stream: StreamNumber) -> bool {

@@ -57,6 +57,20 @@ impl RawStream {
         }
     }
 
+    /// Asks for a session once.
+    ///
+    /// # Errors
+    /// The status with which the stream ended, where there was no place for it.
+    pub async fn try_start(mut self, start: v1::SessionStart) -> Result<(Self, v1::SessionAccepted), Status> {
+        let message = v1::StreamObservationsRequest { message: Some(Request::Start(start)) };
+        // A stream for which there is no place may be closed before it takes anything: its end tells why.
+        let _ = timeout(PATIENCE, self.requests.as_ref().unwrap().send(message)).await;
+        match self.answer_or_end().await? {
+            Some(Response::Accepted(accepted)) => Ok((self, accepted)),
+            other => panic!("not accepted: {other:?}"),
+        }
+    }
+
     /// Asks for a session that is not given; the status with which the stream ends.
     pub async fn start_error(mut self, start: v1::SessionStart) -> Status {
         self.send(Request::Start(start)).await;

@@ -27,6 +27,8 @@ const ERASURE_DUE: &str = "erasure due";
 
 /// Length of one filler; the store begins a new log where one has outgrown 64 MB.
 const FILLER_BYTES: usize = 8 << 20;
+/// Fillers that outgrow a log.
+const FILLERS_PER_LOG: u64 = 9;
 /// Pause between two looks at what the store writes in the background.
 const FLUSH_PAUSE: Duration = Duration::from_millis(2);
 /// Fillers after which a log must have been outgrown, many times over.
@@ -147,9 +149,14 @@ impl Store {
     /// Fills the log until every log that is there now has been replaced and removed.
     fn outgrow_logs(&self) -> Result<(), JournalError> {
         let before = logs(&self.folder)?;
+        // What is in memory holds the log in which it was written.
+        self.settle()?;
         for number in 0..MOST_FILLERS {
             self.filler.insert("filler", filler(number))?;
-            self.settle()?;
+            self.flush(&self.filler)?;
+            if number % FILLERS_PER_LOG == FILLERS_PER_LOG - 1 {
+                self.settle()?;
+            }
             if logs(&self.folder)?.is_disjoint(&before) {
                 self.filler.clear()?;
                 return Ok(());
@@ -158,13 +165,15 @@ impl Store {
         Err(JournalError::Store("its logs do not give way to new ones".to_owned()))
     }
 
-    /// Writes what is in memory to tables.
+    /// Writes what is in memory to tables, and something new in every keyspace.
     fn settle(&self) -> Result<(), JournalError> {
-        self.filler.insert("settled", [])?;
-        for keyspace in self.keyspaces() {
+        for keyspace in self.keyspaces().chain([&self.filler]) {
+            // A log goes when each keyspace has a table that is younger. One whose entries were all deleted may have been
+            // compacted to no table at all, and would hold its logs for ever. What is removed here never was.
+            keyspace.remove("settled")?;
             self.flush(keyspace)?;
         }
-        self.flush(&self.filler)
+        Ok(())
     }
 
     /// Writes what a keyspace has in memory to tables, and waits for it.

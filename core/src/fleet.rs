@@ -10,7 +10,7 @@
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
 //! 5. [`base`]: the oldest drives are folded, so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it.
-//! 7. [`line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
+//! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
 //!
 //! ```
 //! use lanemap_core::{fleet::*, geometry::georeference::{Anchor, Georeference, Wgs84}, *};

@@ -1,6 +1,6 @@
 //! How well a fused map lies on the true one: absolutely, and relatively, after one rigid motion of the whole map.
 //!
-//! Both maps are sampled every [`STEP_M`] metres. Each sample of the fused map has the true sample nearest to it in plan; their offset
+//! Both maps are sampled every half metre. Each sample of the fused map has the true sample nearest to it in plan; their offset
 //! is split by the direction of the true line. The rigid motion (a shift, a turn about the vertical, a lift) is fitted on
 //! the lateral offsets by reweighted least squares, again and again from the nearest pairs that it gives. Relative errors
 //! are what is left after it; absolute ones are measured between the same pairs without it.

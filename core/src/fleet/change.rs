@@ -1,7 +1,7 @@
 //! Change: what is on the road now that was not, and what was and is no more.
 //!
-//! Every knot of every line has a belief that it is there ([`persistence`](super::persistence)). Where the belief turns, neighbouring knots
-//! that turned with the same few drives are one event. A stretch that went beside one that came, at most [`MOVED_M`]
+//! Every knot of every line has a belief that it is there (`persistence`). Where the belief turns, neighbouring knots
+//! that turned with the same few drives are one event. A stretch that went beside one that came, at most 2.5 m
 //! across, was moved. The probability of an event is the mean of its knots'.
 //!
 //! Not guaranteed: a move by less than about 0.7 m, which matching takes for the error of a drive, and a new category on

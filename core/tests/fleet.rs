@@ -108,6 +108,18 @@ fn folding_older_drives_moves_no_line_by_more_than_a_few_centimetres() {
 }
 
 #[test]
+fn a_map_of_folded_and_younger_drives_is_no_worse_than_one_of_the_younger_alone() {
+    let road = Road::bend(300.0);
+    let drives = Survey::of(&road, 4).drives(36);
+    let p95 = |drives: &[Contribution]| {
+        let map = fused(drives);
+        quantile(&misfits_m(&map, &road, best_shift(&map, &road)), 0.95)
+    };
+    let (younger, all) = (p95(&drives[16..]), p95(&drives));
+    assert!(all <= younger, "{all} m with the folded, {younger} m without");
+}
+
+#[test]
 fn a_drive_that_is_taken_out_leaves_the_map_of_the_others() {
     let road = Road::bend(200.0);
     let drives = Survey::of(&road, 5).drives(5);

@@ -1,8 +1,8 @@
 //! The base: what is left of drives that were folded.
 //!
-//! Its lines keep the sum of the information of all of them at each knot, less what the final alignment costs: so the mean of
-//! base and younger drives is nearly that of all. In alignment it is one more drive: it may be shifted as a whole, held where it is by the GNSS biases of its
-//! drives, whose mean has the variance `s_b^2 / n`; and it is turned by nothing.
+//! Its lines keep the sum of the information of all of them at each knot, less what the final alignment costs: so the mean
+//! of base and younger drives is nearly that of all. In alignment it is one more drive: it may be shifted as a whole,
+//! held where it is by the GNSS biases of its drives, whose mean has the variance `1 / sum 1 / s_b^2`; it hardly turns.
 
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,6 @@ use super::{
     correction::{Correction, CorrectionKnot},
     fusion::Fusion,
     line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
-    params::FleetParams,
     prepared::{Restraints, SharedFix, normal_of},
 };
 
@@ -23,6 +22,8 @@ const SHAPE_SIGMA_M: f64 = 0.06;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Base {
     drives: u32,
+    /// Sum of what the drives' receivers say of where it lies, horizontally and in height, 1/m^2.
+    gnss_information: [f64; 2],
     lines: Vec<BaseLine>,
 }
 
@@ -49,26 +50,27 @@ impl Base {
         self.drives as usize
     }
 
-    /// Its lines, on which younger drives are laid; it is number `drive` among the corrections.
-    pub(super) fn lines(&self, drive: usize) -> Lines {
+    /// Its lines where its correction puts them: younger drives are laid on them. It is number `drive` among the corrections.
+    pub(super) fn lines(&self, drive: usize, correction: &Correction) -> Lines {
         let mut lines = Lines::default();
         for base in &self.lines {
             let mut line = Line::new(base.id);
             line.record = base.record;
             line.vote(&base.category_votes, 1.0);
             for knot in &base.knots {
+                let shared = correction.apply(&knot.place, 0.0);
                 let witness = Witness {
                     drive,
                     pass: BASE,
                     lane: 0,
                     map: knot.place,
                     arc_m: 0.0,
-                    shared: knot.place,
+                    shared,
                     lateral_variance_m2: knot.lateral_variance_m2,
                     height_variance_m2: knot.height_variance_m2,
                     share: 1.0,
                 };
-                line.push(knot.place, Knot { witnesses: vec![witness], record: knot.record });
+                line.push(shared, Knot { witnesses: vec![witness], record: knot.record });
             }
             lines.lines.push(line);
         }
@@ -77,7 +79,7 @@ impl Base {
     }
 
     /// What holds it where it is: fixes at the corners of its lines.
-    pub(super) fn restraints(&self, params: &FleetParams) -> Restraints {
+    pub(super) fn restraints(&self) -> Restraints {
         /// Of the corners to each other: the base is stiff.
         const STIFF_M: f64 = 0.01;
         let places = || self.lines.iter().flat_map(|line| line.knots.iter().map(|knot| knot.place));
@@ -89,8 +91,9 @@ impl Base {
             SharedFix { arc_m: 0.0, map: place, shared: place, sigma_m: [STIFF_M; 2] }
         };
         let fixes = if self.lines.is_empty() { Vec::new() } else { corners.into_iter().map(fix).collect() };
-        let sigma_m = params.gnss_bias_sigma_m.max(1.5) / f64::from(self.drives.max(1)).sqrt();
-        Restraints { fixes, bias_sigma_m: [sigma_m; 2], steps: Vec::new() }
+        // Without drives there are no fixes, and no bias is asked for.
+        let bias_sigma_m = self.gnss_information.map(|information| information.max(1e-9).powf(-0.5));
+        Restraints { fixes, bias_sigma_m, steps: Vec::new() }
     }
 }
 
@@ -125,7 +128,13 @@ impl Fusion<'_> {
                 knots: knots.collect(),
             });
         }
-        let placed = self.placed.iter().filter(|placed| **placed).count();
-        Base { drives: before.drives + u32::try_from(placed).unwrap_or(u32::MAX), lines }
+        let mut base = Base { drives: before.drives, gnss_information: before.gnss_information, lines };
+        for (drive, _) in self.drives.iter().zip(&self.placed).filter(|(_, placed)| **placed) {
+            base.drives += 1;
+            for (sum, sigma_m) in base.gnss_information.iter_mut().zip(drive.restraints.bias_sigma_m) {
+                *sum += sigma_m.powi(-2);
+            }
+        }
+        base
     }
 }

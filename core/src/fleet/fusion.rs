@@ -134,9 +134,10 @@ impl<'a> Fusion<'a> {
         let own =
             own.map(|(drive, found)| found.unwrap_or_else(|| drive.rigid_correction(0.0, |point| *point, params)));
         let corrections = own.chain([Correction::identity()]).collect();
+        let lines = base.lines(drives.len(), &Correction::identity());
         let restraints = drives.iter().map(|drive| drive.restraints.clone());
-        let restraints = restraints.chain([base.restraints(params)]).collect();
-        Self { drives, params, base, corrections, restraints, placed, lines: base.lines(drives.len()) }
+        let restraints = restraints.chain([base.restraints()]).collect();
+        Self { drives, params, base, corrections, restraints, placed, lines }
     }
 
     fn run(&mut self) {
@@ -287,7 +288,8 @@ impl<'a> Fusion<'a> {
 
     /// Makes the lines again from the corrections as they are.
     fn draw_lines(&mut self) {
-        self.lines = self.base.lines(self.drives.len());
+        let base = self.drives.len();
+        self.lines = self.base.lines(base, &self.corrections[base]);
         let mut pieces = Pieces::new();
         for (drive, number, pass) in self.passes() {
             self.grow(drive, number, pass, &mut pieces);

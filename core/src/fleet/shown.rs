@@ -1,6 +1,9 @@
 //! What of the lines is shown: stretches that are there, and whose place is known.
 
-use std::{collections::BTreeSet, ops::Range};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    ops::Range,
+};
 
 use super::{
     base::Base,
@@ -8,7 +11,7 @@ use super::{
     line::{BASE, FusedLane, FusedLaneId, FusedPoint, Line, LineRecord},
     params::FleetParams,
     persistence::{Belief, Evidence, LEAST_VIEWS, views},
-    prepared::normal_of,
+    prepared::{PreparedPass, normal_of},
 };
 use crate::category::Category;
 
@@ -48,8 +51,10 @@ impl Fusion<'_> {
         let drives: BTreeSet<usize> = lanes.iter().map(|(drive, ..)| *drive).collect();
         record.drives += u32::try_from(drives.len()).unwrap_or(u32::MAX);
         let mut counted = BTreeSet::new();
+        let passes: BTreeMap<usize, &PreparedPass<'_>> =
+            self.passes().map(|(_, number, pass)| (number, pass)).collect();
         for (drive, number, lane) in lanes {
-            let Some((_, _, pass)) = self.passes().find(|(_, other, _)| *other == number) else { continue };
+            let Some(pass) = passes.get(&number) else { continue };
             let lane = pass.lanes[lane].lane;
             if counted.insert((drive, lane.id)) {
                 record.observations += u64::from(lane.observations);

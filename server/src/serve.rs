@@ -27,6 +27,7 @@ pub mod features;
 mod items;
 pub mod line;
 mod operation;
+mod page;
 pub mod problem;
 mod query;
 #[cfg(test)]

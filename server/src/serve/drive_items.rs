@@ -11,7 +11,6 @@ use axum::{
     response::Response,
 };
 use lanemap_core::MapLane;
-use serde::Serialize;
 
 use super::{
     ServeState,
@@ -20,44 +19,20 @@ use super::{
     extents::Extents,
     features::{Crs, LaneFeature, feature},
     in_background,
+    page::{MOST_COORDINATES, Page, PageQuery, links},
     problem::Problem,
-    query::{Parameters, parse_limit},
-    sessions::{GEOJSON, Link, identity},
+    sessions::{GEOJSON, identity},
 };
 use crate::session::{PublishedMap, SessionId, SessionSummary, Sessions};
 
 /// Path of the collection's items.
 pub(super) const PATH: &str = "/collections/drives/items";
-/// Lanes of a page, where the query does not say.
-pub(super) const DEFAULT_LIMIT: usize = 1_000;
-/// Most lanes of a page.
-pub(super) const MOST_LANES: usize = 10_000;
-/// Most coordinates of a page; the lane that reaches it is the page's last.
-pub(super) const MOST_COORDINATES: usize = 200_000;
 
 /// The last lane of a page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Cursor {
     session: SessionId,
     lane: u64,
-}
-
-/// What a page is asked for.
-#[derive(Clone, Debug, PartialEq)]
-struct PageQuery {
-    bounds: Option<Bounds>,
-    limit: usize,
-    after_exclusive: Option<Cursor>,
-}
-
-/// One page.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename = "FeatureCollection")]
-struct Page {
-    #[serde(rename = "numberReturned")]
-    number_returned: usize,
-    links: Vec<Link>,
-    features: Vec<LaneFeature>,
 }
 
 impl Cursor {
@@ -68,17 +43,6 @@ impl Cursor {
     }
 }
 
-impl PageQuery {
-    fn read(uri: &Uri) -> Result<Self, Problem> {
-        let parameters = Parameters::read(uri, &["bbox", "limit", "after"])?;
-        Ok(Self {
-            bounds: parameters.get("bbox", Bounds::parse)?,
-            limit: parameters.get("limit", |text| parse_limit(text, MOST_LANES))?.unwrap_or(DEFAULT_LIMIT),
-            after_exclusive: parameters.get("after", Cursor::parse)?,
-        })
-    }
-}
-
 /// `GET /collections/drives/items`
 pub(super) async fn items(
     State(state): State<ServeState>,
@@ -86,7 +50,7 @@ pub(super) async fn items(
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let query = PageQuery::read(&uri)?;
+    let query = PageQuery::read(&uri, Cursor::parse)?;
     let summaries = state.sessions.list();
     let asked = uri.query().unwrap_or_default().to_owned();
     let tag = EntityTag::of((summaries.iter().map(|summary| identity(summary)).collect::<Vec<_>>(), &asked));
@@ -107,7 +71,7 @@ struct Candidates {
 }
 
 /// The page that a query asks for; `asked` is the query as it was written.
-fn page(candidates: &Candidates, query: &PageQuery, asked: &str) -> Page {
+fn page(candidates: &Candidates, query: &PageQuery<Cursor>, asked: &str) -> Page<LaneFeature> {
     let mut features = Vec::new();
     let mut coordinates = 0;
     let mut more = false;
@@ -131,7 +95,7 @@ fn page(candidates: &Candidates, query: &PageQuery, asked: &str) -> Page {
 
 impl Candidates {
     /// The maps of georeferenced sessions from the cursor on that may enter the box, read one after the other.
-    fn maps(&self, query: &PageQuery) -> impl Iterator<Item = Arc<PublishedMap>> {
+    fn maps(&self, query: &PageQuery<Cursor>) -> impl Iterator<Item = Arc<PublishedMap>> {
         self.summaries
             .iter()
             .filter(|summary| summary.georeference.is_some())
@@ -142,7 +106,7 @@ impl Candidates {
 }
 
 /// The lanes of a map after the cursor that may enter the box.
-fn lanes<'a>(map: &'a PublishedMap, query: &'a PageQuery) -> impl Iterator<Item = &'a MapLane> {
+fn lanes<'a>(map: &'a PublishedMap, query: &'a PageQuery<Cursor>) -> impl Iterator<Item = &'a MapLane> {
     map.map
         .lanes
         .iter()
@@ -161,21 +125,6 @@ fn may_touch(bounds: Option<Bounds>, around: impl FnOnce() -> Option<Bounds>) ->
 fn around(map: &PublishedMap, lane: &MapLane) -> Option<Bounds> {
     let points = lane.control_points.iter().map(|point| point.position);
     Bounds::around(map.georeference.as_ref()?, points)
-}
-
-/// Links from a page of a collection: to itself, and to the next, where there is more after the feature `last`.
-pub(super) fn links(path: &str, asked: &str, last: Option<&str>) -> Vec<Link> {
-    let link = |rel, query: &str| {
-        let mark = if query.is_empty() { "" } else { "?" };
-        Link { rel, media_type: GEOJSON, href: format!("{path}{mark}{query}") }
-    };
-    let next = last.map(|last| {
-        let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("after="));
-        let query: Vec<&str> = kept.collect();
-        let after = format!("after={last}");
-        link("next", &query.into_iter().chain([after.as_str()]).collect::<Vec<_>>().join("&"))
-    });
-    std::iter::once(link("self", asked)).chain(next).collect()
 }
 
 #[cfg(test)]
@@ -199,14 +148,14 @@ mod tests {
             .collect()
     }
 
-    fn ask(query: &str) -> Page {
+    fn ask(query: &str) -> Page<LaneFeature> {
         let uri = format!("{PATH}?{query}").parse().unwrap();
         let sessions = Sessions::default();
         for map in three_sessions() {
             sessions.publish(map);
         }
         let candidates = Candidates { summaries: sessions.list(), sessions, extents: Extents::default() };
-        page(&candidates, &PageQuery::read(&uri).unwrap(), query)
+        page(&candidates, &PageQuery::read(&uri, Cursor::parse).unwrap(), query)
     }
 
     #[test]
@@ -249,7 +198,9 @@ mod tests {
             [("limit=0", "limit"), ("limit=10001", "limit"), ("limit=-1", "limit"), ("after=3", "after")]
         {
             let uri = format!("{PATH}?{query}").parse().unwrap();
-            let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri) else { panic!("{query}") };
+            let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri, Cursor::parse) else {
+                panic!("{query}")
+            };
             assert_eq!(name, parameter);
         }
     }

@@ -12,17 +12,15 @@ use axum::{
 };
 use lanemap_core::fleet::CellId;
 use lanemap_proto::v1;
-use serde::Serialize;
 
 use super::{
     ServeState,
     bounds::Bounds,
-    drive_items::{DEFAULT_LIMIT, MOST_COORDINATES, MOST_LANES, links},
     entity_tag::EntityTag,
     in_background,
+    page::{MOST_COORDINATES, Page, PageQuery, links},
     problem::Problem,
-    query::{Parameters, parse_limit},
-    sessions::{GEOJSON, Link},
+    sessions::GEOJSON,
     shared_lanes::{SharedLane, shared_lane},
 };
 use crate::{
@@ -41,24 +39,6 @@ struct Cursor {
     part: u32,
 }
 
-/// What a page is asked for.
-#[derive(Clone, Debug, PartialEq)]
-struct PageQuery {
-    bounds: Option<Bounds>,
-    limit: usize,
-    after_exclusive: Option<Cursor>,
-}
-
-/// One page.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename = "FeatureCollection")]
-struct Page {
-    #[serde(rename = "numberReturned")]
-    number_returned: usize,
-    links: Vec<Link>,
-    features: Vec<SharedLane>,
-}
-
 impl Cursor {
     fn parse(text: &str) -> Result<Self, String> {
         let mut parts = text.split('.');
@@ -75,16 +55,7 @@ impl Cursor {
     }
 }
 
-impl PageQuery {
-    fn read(uri: &Uri) -> Result<Self, Problem> {
-        let parameters = Parameters::read(uri, &["bbox", "limit", "after"])?;
-        Ok(Self {
-            bounds: parameters.get("bbox", Bounds::parse)?,
-            limit: parameters.get("limit", |text| parse_limit(text, MOST_LANES))?.unwrap_or(DEFAULT_LIMIT),
-            after_exclusive: parameters.get("after", Cursor::parse)?,
-        })
-    }
-
+impl PageQuery<Cursor> {
     /// Whether a cell may have lines of the page.
     fn wants(&self, cell: CellId) -> bool {
         self.after_exclusive.as_ref().is_none_or(|after| after.cell <= cell)
@@ -100,7 +71,7 @@ pub(super) fn of_cell(cell: CellId) -> Bounds {
 
 /// `GET /collections/lanes/items`
 pub(super) async fn items(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
-    let query = PageQuery::read(&uri)?;
+    let query = PageQuery::read(&uri, Cursor::parse)?;
     let mut cells = state.map.list();
     cells.retain(|(cell, record)| record.lanes > 0 && query.wants(*cell));
     let asked = uri.query().unwrap_or_default().to_owned();
@@ -120,9 +91,9 @@ pub(super) async fn items(State(state): State<ServeState>, uri: Uri, headers: He
 fn page(
     map: &SharedMap,
     cells: &[(CellId, Arc<CellRecord>)],
-    query: &PageQuery,
+    query: &PageQuery<Cursor>,
     asked: &str,
-) -> Result<Page, JournalError> {
+) -> Result<Page<SharedLane>, JournalError> {
     let mut features = Vec::new();
     let mut coordinates = 0;
     let mut more = false;
@@ -161,7 +132,9 @@ mod tests {
             ("after=14-1-1.x.0", "after"),
         ] {
             let uri = format!("{PATH}?{query}").parse().unwrap();
-            let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri) else { panic!("{query}") };
+            let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri, Cursor::parse) else {
+                panic!("{query}")
+            };
             assert_eq!(name, parameter);
         }
     }

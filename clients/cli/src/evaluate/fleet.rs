@@ -6,7 +6,7 @@ mod recorded;
 mod report;
 mod simulated;
 
-use std::path::PathBuf;
+use std::{collections::BTreeSet, path::PathBuf};
 
 use clap::{Args, ValueEnum};
 use lanemap_core::{
@@ -95,7 +95,7 @@ pub struct ByDrives {
     pub apart: f64,
     /// Share of the line names that the map of one drive fewer had, too.
     pub kept_names: Option<f64>,
-    /// Bytes of the map as it is stored.
+    /// Bytes of the map, were it packed as [`contributed::packed_bytes`] says.
     pub bytes: f64,
     /// Milliseconds of fusing, median.
     pub fuse_ms: f64,
@@ -136,7 +136,7 @@ fn by_drives(road: &Road, counts: &[usize], choose: bool) -> Vec<ByDrives> {
 fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
     let most = road.contributions.len();
     let choices = if choose && count < most { most } else { 1 };
-    let (mut scores, mut apart, mut bytes, mut times) = (Vec::new(), 0, 0.0, Vec::new());
+    let (mut scores, mut apart, mut bytes, mut times, mut kept) = (Vec::new(), 0, 0.0, Vec::new(), None);
     for first in 0..choices {
         let chosen: Vec<Contribution> =
             (0..count).map(|step| road.contributions[(first + step) % most].clone()).collect();
@@ -144,29 +144,26 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
         let map = fuse(&chosen, &road.anchor, &FleetParams::default());
         times.push(began.elapsed().as_secs_f64() * 1e3);
         apart += map.drives.iter().filter(|drive| drive.correction.is_none()).count();
-        bytes += contributed::stored_bytes(&map) as f64;
+        bytes += contributed::packed_bytes(&map) as f64;
         scores.extend(score_fleet(&polylines(&map), &road.truth));
+        kept = (!choose && count > 1).then(|| kept_names(road, count, &map));
     }
-    let kept_names = (!choose && count > 1).then(|| kept_names(road, count));
     let choices = choices as f64;
     ByDrives {
         drives: count,
         scores,
         apart: apart as f64 / choices,
-        kept_names,
+        kept_names: kept,
         bytes: bytes / choices,
         fuse_ms: lanemap_core::evaluation::quantile(&mut times, 0.5),
     }
 }
 
-/// Share of the names in the map of one drive fewer that the map still has.
-fn kept_names(road: &Road, count: usize) -> f64 {
-    let names = |count: usize| -> std::collections::BTreeSet<_> {
-        let map = fuse(&road.contributions[..count], &road.anchor, &FleetParams::default());
-        map.lanes.iter().map(|lane| lane.id).collect()
-    };
-    let (before, after) = (names(count - 1), names(count));
-    before.intersection(&after).count() as f64 / before.len().max(1) as f64
+/// Share of the names in the map of one drive fewer that this map still has.
+fn kept_names(road: &Road, count: usize, map: &FusedMap) -> f64 {
+    let names = |map: &FusedMap| map.lanes.iter().map(|lane| lane.id).collect::<BTreeSet<_>>();
+    let before = names(&fuse(&road.contributions[..count - 1], &road.anchor, &FleetParams::default()));
+    before.intersection(&names(map)).count() as f64 / before.len().max(1) as f64
 }
 
 /// The lines of a map as polylines.

@@ -231,7 +231,8 @@ impl FleetDrive<'_> {
 
 #[expect(clippy::expect_used, reason = "simulated numbers are finite and lie within kilometres of the anchor")]
 fn valid(parts: FrameParts) -> Frame {
-    Frame::new(parts, &FrameLimits::default()).expect("a simulated frame is valid")
+    Frame::new(parts, &FrameLimits::default())
+        .expect("simulated numbers are finite and lie within kilometres of the anchor")
 }
 
 fn odometry_frame(states: &[TrueState]) -> Pose {

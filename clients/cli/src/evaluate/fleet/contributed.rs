@@ -17,8 +17,8 @@ pub fn contribution(drive: DriveId, sensor: Sensor, frames: impl Iterator<Item =
 }
 
 /// Bytes of a map at a millimetre per coordinate, two bytes of sigma and one of existence and support per knot, and the
-/// names: what a store that packs it would keep.
-pub fn stored_bytes(map: &FusedMap) -> usize {
+/// names: an estimate: no store packs it so yet.
+pub fn packed_bytes(map: &FusedMap) -> usize {
     const KNOT: usize = 3 * 2 + 2 + 2;
     const LINE: usize = 32;
     map.lanes.iter().map(|lane| LINE + KNOT * lane.points.len()).sum()

@@ -4,7 +4,8 @@
 //! 2. A worker cuts the offer into [contributions](offer) per cell and puts those that changed into the store.
 //! 3. A cell whose contributions are not those that it was fused from is dirty: a worker fuses it (`lanemap_core::fleet::fuse`),
 //!    [cuts](border) its lines at the tile's border, and joins them with those of its neighbours.
-//! 4. Where its [bytes](wire) differ, a new version is made durable and [swapped in](shared_map) for readers.
+//! 4. Where its [bytes](wire) differ, a new version is made durable, which gives the map its next [revision](publications),
+//!    and [swapped in](shared_map) for readers.
 //!
 //! Workers are threads of their own, never the runtime's; they take tasks in the order in which these became due
 //! ([`queue`]), and rest in between, so that they take no more than a share of a core. What a cell is fused from is its
@@ -14,6 +15,7 @@ mod bases;
 pub(crate) mod border;
 mod cell_record;
 pub(crate) mod offer;
+pub mod publications;
 mod queue;
 pub mod shared_map;
 pub mod wire;
@@ -26,7 +28,7 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread::{self, JoinHandle},
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
 use lanemap_core::fleet::CellId;
@@ -34,7 +36,8 @@ use tokio::sync::watch;
 
 pub use cell_record::{CellRecord, CellVersion};
 pub(crate) use offer::Offer;
-pub use shared_map::{ChangesError, PublishedCell, SharedMap};
+pub use publications::{MapRevision, RevisionError};
+pub use shared_map::{ChangesError, KeptVersion, PublishedCell, SharedMap};
 
 use crate::{
     config::ServerConfig,
@@ -43,6 +46,7 @@ use crate::{
 };
 use bases::Bases;
 use cell_record::{FORMAT, fingerprint};
+use publications::Publications;
 use queue::Queue;
 use worker::Worker;
 
@@ -126,7 +130,8 @@ impl Fuser {
         for (session, contributed) in store.contributed()? {
             queue.has_contributed(session, contributed);
         }
-        map.begin(records, store.clone());
+        let publications = Publications::open(store, records.iter().map(|(cell, record)| (*cell, record.version)))?;
+        map.begin(records, publications, store.clone());
         let shared = Shared {
             settings,
             map,
@@ -231,4 +236,10 @@ impl FuseThreads {
             tracing::error!("a fusing thread has failed");
         }
     }
+}
+
+/// Milliseconds since the Unix epoch.
+fn now_ms() -> u64 {
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
 }

@@ -130,7 +130,7 @@ impl MapService for MapGrpc {
         let (cell, shared) = (cell(&request.into_inner().cell)?, self.map.clone());
         let found = read(move || Ok(shared.get(cell)?)).await?;
         let found = found.ok_or(ChangesError::NoSuchCell { cell }).map_err(refused)?;
-        Ok(Response::new(v1::GetCellResponse { map: Some(found.map.clone()) }))
+        Ok(Response::new(v1::GetCellResponse { map: Some(v1::CellMap::clone(&found.map)) }))
     }
 
     async fn get_changes(

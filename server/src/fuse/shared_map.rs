@@ -6,7 +6,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     fmt,
-    sync::{Arc, PoisonError, RwLock},
+    sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock},
 };
 
 use arc_swap::{ArcSwap, ArcSwapOption};
@@ -20,6 +20,7 @@ use tokio::sync::watch;
 
 use super::{
     CellRecord, CellVersion,
+    publications::{MapChanges, MapRevision, Publication, Publications, RevisionError},
     wire::{changes, empty_cell},
 };
 use crate::{
@@ -36,7 +37,16 @@ pub struct PublishedCell {
     /// What is told of it.
     pub record: Arc<CellRecord>,
     /// Its lines.
-    pub map: v1::CellMap,
+    pub map: Arc<v1::CellMap>,
+    /// The bytes of `map`: the same for the same version.
+    pub bytes: Bytes,
+}
+
+/// A version of a cell that may have been replaced.
+#[derive(Clone, Debug)]
+pub struct KeptVersion {
+    /// Its lines.
+    pub map: Arc<v1::CellMap>,
     /// The bytes of `map`: the same for the same version.
     pub bytes: Bytes,
 }
@@ -76,11 +86,32 @@ pub struct SharedMap {
 }
 
 struct Shared {
-    cells: RwLock<BTreeMap<CellId, Arc<CellRecord>>>,
+    cells: RwLock<Cells>,
     read: Cache<(CellId, CellVersion), Arc<PublishedCell>, MemoryWeight>,
+    past: Cache<(CellId, CellVersion), Arc<KeptVersion>, MemoryWeight>,
+    /// The last revision that was given, published or not.
+    last_given: Mutex<MapRevision>,
     store: ArcSwapOption<CellStore>,
     waiting: ArcSwap<Waiting>,
     publications: watch::Sender<u64>,
+}
+
+/// What is told of all cells at one revision.
+#[derive(Default)]
+struct Cells {
+    records: BTreeMap<CellId, Arc<CellRecord>>,
+    publications: Publications,
+}
+
+/// The turn of the one thread that publishes: readers see revisions in their order.
+pub(super) struct Turn<'a>(MutexGuard<'a, MapRevision>);
+
+impl Turn<'_> {
+    /// The next revision. It is given once, whatever becomes of what is written under it.
+    pub(super) fn next(&mut self) -> MapRevision {
+        self.0.0 += 1;
+        *self.0
+    }
 }
 
 /// What is not in the map yet.
@@ -96,9 +127,19 @@ struct MemoryWeight;
 
 impl Weighter<(CellId, CellVersion), Arc<PublishedCell>> for MemoryWeight {
     fn weight(&self, _: &(CellId, CellVersion), cell: &Arc<PublishedCell>) -> u64 {
-        // Numbers that are one or two bytes on the wire are four in memory.
-        (4 * cell.bytes.len() + 256 * cell.map.lanes.len() + 512) as u64
+        memory_bytes(&cell.map, &cell.bytes)
     }
+}
+
+impl Weighter<(CellId, CellVersion), Arc<KeptVersion>> for MemoryWeight {
+    fn weight(&self, _: &(CellId, CellVersion), kept: &Arc<KeptVersion>) -> u64 {
+        memory_bytes(&kept.map, &kept.bytes)
+    }
+}
+
+fn memory_bytes(map: &v1::CellMap, bytes: &Bytes) -> u64 {
+    // Numbers that are one or two bytes on the wire are four in memory.
+    (4 * bytes.len() + 256 * map.lanes.len() + 512) as u64
 }
 
 impl fmt::Debug for SharedMap {
@@ -108,12 +149,15 @@ impl fmt::Debug for SharedMap {
 }
 
 impl SharedMap {
-    /// A map without cells, whose lines take at most `cache_bytes`.
+    /// A map without cells, whose lines take at most `cache_bytes`: three quarters for the newest versions, the rest for
+    /// replaced ones.
     #[must_use]
     pub fn new(cache_bytes: usize) -> Self {
         let shared = Shared {
             cells: RwLock::default(),
-            read: Cache::with_weighter(64, cache_bytes as u64, MemoryWeight),
+            read: Cache::with_weighter(64, cache_bytes as u64 / 4 * 3, MemoryWeight),
+            past: Cache::with_weighter(64, cache_bytes as u64 / 4, MemoryWeight),
+            last_given: Mutex::default(),
             store: ArcSwapOption::empty(),
             waiting: ArcSwap::default(),
             publications: watch::Sender::default(),
@@ -122,9 +166,10 @@ impl SharedMap {
     }
 
     /// Begins with what the store has.
-    pub(super) fn begin(&self, records: BTreeMap<CellId, CellRecord>, store: CellStore) {
-        let records = records.into_iter().map(|(cell, record)| (cell, Arc::new(record)));
-        *self.shared.cells.write().unwrap_or_else(PoisonError::into_inner) = records.collect();
+    pub(super) fn begin(&self, records: BTreeMap<CellId, CellRecord>, publications: Publications, store: CellStore) {
+        *self.shared.last_given.lock().unwrap_or_else(PoisonError::into_inner) = publications.newest();
+        let records = records.into_iter().map(|(cell, record)| (cell, Arc::new(record))).collect();
+        *self.shared.cells.write().unwrap_or_else(PoisonError::into_inner) = Cells { records, publications };
         self.shared.store.store(Some(Arc::new(store)));
         self.count();
     }
@@ -137,14 +182,64 @@ impl SharedMap {
     /// What is told of every cell, in their order.
     #[must_use]
     pub fn list(&self) -> Vec<(CellId, Arc<CellRecord>)> {
-        let cells = self.shared.cells.read().unwrap_or_else(PoisonError::into_inner);
-        cells.iter().map(|(cell, record)| (*cell, Arc::clone(record))).collect()
+        self.at_once(Cells::list)
+    }
+
+    /// The newest revision, and what is told of every cell at it.
+    #[must_use]
+    pub fn list_with_revision(&self) -> (MapRevision, Vec<(CellId, Arc<CellRecord>)>) {
+        self.at_once(|cells| (cells.publications.newest(), cells.list()))
     }
 
     /// What is told of one cell.
     #[must_use]
     pub fn record(&self, cell: CellId) -> Option<Arc<CellRecord>> {
-        self.shared.cells.read().unwrap_or_else(PoisonError::into_inner).get(&cell).map(Arc::clone)
+        self.at_once(|cells| cells.records.get(&cell).map(Arc::clone))
+    }
+
+    /// The newest revision; 0: nothing was ever published.
+    #[must_use]
+    pub fn revision(&self) -> MapRevision {
+        self.at_once(|cells| cells.publications.newest())
+    }
+
+    /// The oldest revision of which [`SharedMap::changed_since`] and [`SharedMap::versions_at`] tell.
+    #[must_use]
+    pub fn oldest_revision(&self) -> MapRevision {
+        self.at_once(|cells| cells.publications.oldest())
+    }
+
+    /// Which cells changed since a revision.
+    ///
+    /// # Errors
+    /// A revision that is not kept any more, or not there yet.
+    pub fn changed_since(&self, since: MapRevision) -> Result<MapChanges, RevisionError> {
+        self.at_once(|cells| cells.publications.changed_since(since))
+    }
+
+    /// The version of every cell at a revision, cells without lines left out that had never had any. Read them with
+    /// [`SharedMap::version_of`].
+    ///
+    /// # Errors
+    /// A revision that is not kept any more, or not there yet.
+    pub fn versions_at(&self, revision: MapRevision) -> Result<BTreeMap<CellId, CellVersion>, RevisionError> {
+        self.at_once(|cells| {
+            let mut versions = cells.records.iter().map(|(cell, record)| (*cell, record.version)).collect();
+            cells.publications.go_back(&mut versions, revision)?;
+            Ok(versions)
+        })
+    }
+
+    /// The publications after a revision, the oldest first, at most so many.
+    ///
+    /// # Errors
+    /// A revision that is not kept any more, or not there yet.
+    pub fn publications_after(&self, since: MapRevision, most: usize) -> Result<Vec<Publication>, RevisionError> {
+        self.at_once(|cells| Ok(cells.publications.after(since)?.take(most).copied().collect()))
+    }
+
+    fn at_once<T>(&self, read: impl FnOnce(&Cells) -> T) -> T {
+        read(&self.shared.cells.read().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Whether drives have said something of a cell that is not in its map yet.
@@ -182,7 +277,37 @@ impl SharedMap {
     fn read(&self, cell: CellId, record: &Arc<CellRecord>) -> Result<Option<PublishedCell>, ReadError> {
         let Some(map) = self.version(cell, record.version.0)? else { return Ok(None) };
         let bytes = map.encode_to_vec().into();
-        Ok(Some(PublishedCell { record: Arc::clone(record), map, bytes }))
+        Ok(Some(PublishedCell { record: Arc::clone(record), map: Arc::new(map), bytes }))
+    }
+
+    /// One version of a cell, where it is kept: replaced versions are for `cell_versions_kept_s`, at most 128 of a cell, and
+    /// none that has a deleted drive in it. Version 0 is empty. Reads the store where it is not in the cache.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn version_of(&self, cell: CellId, version: CellVersion) -> Result<Option<Arc<KeptVersion>>, JournalError> {
+        let Some(record) = self.record(cell).filter(|record| version <= record.version) else { return Ok(None) };
+        if version == record.version
+            && let Some(newest) = self.get(cell)?.filter(|newest| newest.map.version == version.0)
+        {
+            return Ok(Some(Arc::new(KeptVersion { map: Arc::clone(&newest.map), bytes: newest.bytes.clone() })));
+        }
+        // Whether it is kept is asked of the store each time: a version of which a drive was deleted is read no more.
+        let store = self.shared.store.load_full().ok_or(JournalError::Closed)?;
+        if version.0 > 0 && !store.has_version(cell, version.0)? {
+            self.shared.past.remove(&(cell, version));
+            return Ok(None);
+        }
+        let read = || {
+            let map = self.version(cell, version.0)?.ok_or(ReadError::Outdated)?;
+            let bytes = map.encode_to_vec().into();
+            Ok(Arc::new(KeptVersion { map: Arc::new(map), bytes }))
+        };
+        match self.shared.past.get_or_insert_with(&(cell, version), read) {
+            Ok(found) => Ok(Some(found)),
+            Err(ReadError::Store(error)) => Err(error),
+            Err(ReadError::Outdated) => Ok(None),
+        }
     }
 
     /// One version of a cell, where it is kept; version 0 is empty.
@@ -212,16 +337,40 @@ impl SharedMap {
         Ok(changes(&before, &newest.map))
     }
 
+    /// The turn to publish; waits while another thread has it.
+    pub(super) fn turn(&self) -> Turn<'_> {
+        Turn(self.shared.last_given.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// The revisions of publications that are not kept once another comes: published before `since_ms`, or too many.
+    pub(super) fn outdated_publications(&self, since_ms: u64) -> Vec<MapRevision> {
+        self.at_once(|cells| cells.publications.outdated(since_ms))
+    }
+
+    pub(super) fn drop_publications_until(&self, last: MapRevision) {
+        let mut cells = self.shared.cells.write().unwrap_or_else(PoisonError::into_inner);
+        cells.publications.drop_until(last);
+    }
+
     /// Makes a version, which is on the disk, the newest of its cell.
-    pub(super) fn publish(&self, cell: CellId, record: CellRecord, map: Option<(v1::CellMap, Bytes)>) {
+    pub(super) fn publish(
+        &self,
+        cell: CellId,
+        record: CellRecord,
+        map: Option<(v1::CellMap, Bytes)>,
+        publication: Option<Publication>,
+    ) {
         let record = Arc::new(record);
         if let Some((map, bytes)) = map {
-            let published = PublishedCell { record: Arc::clone(&record), map, bytes };
+            let published = PublishedCell { record: Arc::clone(&record), map: Arc::new(map), bytes };
             self.shared.read.insert((cell, record.version), Arc::new(published));
         }
         let mut cells = self.shared.cells.write().unwrap_or_else(PoisonError::into_inner);
-        let before = cells.insert(cell, Arc::clone(&record));
-        metrics::gauge!(telemetry::CELLS).set(cells.len() as f64);
+        let before = cells.records.insert(cell, Arc::clone(&record));
+        if let Some(publication) = publication {
+            cells.publications.push(publication);
+        }
+        metrics::gauge!(telemetry::CELLS).set(cells.records.len() as f64);
         drop(cells);
         if let Some(before) = before.filter(|before| before.version != record.version) {
             self.shared.read.remove(&(cell, before.version));
@@ -243,6 +392,12 @@ impl SharedMap {
 
     fn count(&self) {
         self.shared.publications.send_modify(|count| *count += 1);
+    }
+}
+
+impl Cells {
+    fn list(&self) -> Vec<(CellId, Arc<CellRecord>)> {
+        self.records.iter().map(|(cell, record)| (*cell, Arc::clone(record))).collect()
     }
 }
 

@@ -3,7 +3,7 @@
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{PoisonError, atomic::Ordering},
-    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+    time::{Duration, Instant},
 };
 
 use lanemap_core::fleet::{CellId, DriveId, FleetParams, FusedMap};
@@ -14,6 +14,8 @@ use super::{
     CellRecord, CellVersion, Fuser, Offer,
     border::{self, Crossing, Piece},
     cell_record::fingerprint,
+    now_ms,
+    publications::Publication,
     queue::{Taken, Task, Wanted},
     wire,
 };
@@ -51,6 +53,15 @@ struct Fused {
     crossings: Vec<Crossing>,
     map: FusedMap,
     took: Duration,
+}
+
+/// What of a cell is replaced.
+struct Past {
+    version: CellVersion,
+    /// Contributions that are no longer kept.
+    dropped: Vec<SessionId>,
+    /// A drive in it was deleted.
+    purged: bool,
 }
 
 impl Worker {
@@ -222,26 +233,69 @@ impl Worker {
             let bytes = next.encode_to_vec();
             (next, bytes)
         });
-        let write = CellWrite {
-            cell,
-            newest: record.version.0,
-            told: encoded("a cell", &record)?,
-            lines: fused.as_ref().map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
-            outdated: self.outdated(cell, next.is_some(), purged)?,
-            version: next.as_ref().map(|(map, bytes)| NewVersion {
-                version: map.version,
-                published_ms: now_ms(),
-                bytes: bytes.clone(),
-            }),
-            dropped,
-            purged,
-        };
         if fused.is_some() || next.is_some() || purged {
-            self.store.put_cell(write)?;
-            map.publish(cell, record.clone(), next.map(|(map, bytes)| (map, bytes.into())));
+            let past = Past { version: before.version, dropped, purged };
+            self.write(cell, record.clone(), fused.as_ref(), next, past)?;
         }
         self.tell_neighbours(cell, &before.crossings, &record.crossings);
         Ok(())
+    }
+
+    /// Makes a fused cell durable, and what is new in it the next revision of the map, which readers then see.
+    fn write(
+        &self,
+        cell: CellId,
+        record: CellRecord,
+        fused: Option<&Fused>,
+        next: Option<(v1::CellMap, Vec<u8>)>,
+        past: Past,
+    ) -> Result<(), JournalError> {
+        let Past { version: from_version, dropped, purged } = past;
+        let outdated = self.outdated(cell, next.is_some(), purged)?;
+        let published_ms = now_ms();
+        let map = &self.fuser.shared.map;
+        let mut turn = map.turn();
+        let publication = next.is_some().then(|| Publication {
+            revision: turn.next(),
+            cell,
+            from_version,
+            to_version: record.version,
+            published_ms,
+        });
+        let version = next.as_ref().zip(publication).map(|((map, bytes), publication)| {
+            Ok::<_, JournalError>(NewVersion {
+                version: map.version,
+                published_ms,
+                bytes: bytes.clone(),
+                revision: publication.revision.0,
+                publication: encoded("a publication", &publication)?,
+            })
+        });
+        let outdated_revisions =
+            if publication.is_some() { map.outdated_publications(self.oldest_kept_ms()) } else { Vec::new() };
+        self.store.put_cell(CellWrite {
+            cell,
+            newest: record.version.0,
+            told: encoded("a cell", &record)?,
+            lines: fused.map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
+            version: version.transpose()?,
+            outdated,
+            outdated_revisions: outdated_revisions.iter().map(|revision| revision.0).collect(),
+            dropped,
+            purged,
+        })?;
+        map.publish(cell, record, next.map(|(map, bytes)| (map, bytes.into())), publication);
+        if let Some(last) = outdated_revisions.last() {
+            map.drop_publications_until(*last);
+        }
+        drop(turn);
+        Ok(())
+    }
+
+    /// Time before which what was replaced is kept no longer, milliseconds since the Unix epoch.
+    fn oldest_kept_ms(&self) -> u64 {
+        let kept = self.fuser.shared.settings.versions_kept;
+        now_ms().saturating_sub(u64::try_from(kept.as_millis()).unwrap_or(u64::MAX))
     }
 
     /// Takes the oldest drives out, where there are more than a cell keeps.
@@ -276,8 +330,7 @@ impl Worker {
             return Ok(versions.into_iter().map(|(version, _)| version).collect());
         }
         let versions = self.store.versions(cell)?;
-        let kept = self.fuser.shared.settings.versions_kept;
-        let since_ms = now_ms().saturating_sub(u64::try_from(kept.as_millis()).unwrap_or(u64::MAX));
+        let since_ms = self.oldest_kept_ms();
         let excess = versions.len().saturating_sub(MOST_VERSIONS - 1);
         let replaced_ms = versions.iter().skip(1).map(|(_, published_ms)| *published_ms).chain([u64::MAX]);
         let outdated = versions
@@ -321,9 +374,4 @@ fn length_and_sigma(lanes: &[v1::FusedLane]) -> (f64, f64) {
     sigmas.sort_unstable();
     let median = sigmas.get(sigmas.len() / 2).map_or(0.0, |sigma| f64::from(*sigma) * 1e-3);
     (lanes.iter().map(length).sum(), median)
-}
-
-fn now_ms() -> u64 {
-    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
 }

@@ -9,6 +9,7 @@
 //! | `cell_lines`        | cell                                   | its lines as fused, the fuser's own        |
 //! | `cell_versions`     | cell, then version, 8 bytes big-endian | when it was published, then its bytes      |
 //! | `cell_purges`       | cell                                   | none: a drive in it was deleted            |
+//! | `publications`      | revision, 8 bytes big-endian           | which version of which cell, postcard      |
 //!
 //! Contributions are written without waiting for the disk: whatever a crash takes of them, the drives' snapshots and
 //! frames give again. Versions are on the disk before anybody reads them, so that none is ever given twice.
@@ -68,6 +69,10 @@ pub(crate) struct NewVersion {
     /// Milliseconds since the Unix epoch.
     pub(crate) published_ms: u64,
     pub(crate) bytes: Vec<u8>,
+    /// The revision that it gives the map.
+    pub(crate) revision: u64,
+    /// What is told of its publication.
+    pub(crate) publication: Vec<u8>,
 }
 
 /// How a fused cell is written.
@@ -84,6 +89,8 @@ pub(crate) struct CellWrite {
     pub(crate) version: Option<NewVersion>,
     /// Versions that are no longer kept.
     pub(crate) outdated: Vec<u64>,
+    /// Revisions whose publications are no longer kept.
+    pub(crate) outdated_revisions: Vec<u64>,
     /// Contributions that are no longer kept.
     pub(crate) dropped: Vec<SessionId>,
     /// What of a deleted drive was in the versions before goes with them.
@@ -194,6 +201,11 @@ impl CellStore {
         Ok(value.and_then(|value| Some(value.get(8..)?.to_vec())))
     }
 
+    /// Whether a version of a cell is kept.
+    pub(crate) fn has_version(&self, cell: CellId, version: u64) -> Result<bool, JournalError> {
+        Ok(self.store.get()?.cell_versions.contains_key(versioned(cell, version))?)
+    }
+
     /// The versions of a cell that are kept, the oldest first, and when each was published, milliseconds since the epoch.
     pub(crate) fn versions(&self, cell: CellId) -> Result<Vec<(u64, u64)>, JournalError> {
         self.store
@@ -205,6 +217,22 @@ impl CellStore {
                 Ok((number(key.get(8..))?, number(value.get(..8))?))
             })
             .collect()
+    }
+
+    /// What is told of the publications that are kept, in the order of their revisions.
+    pub(crate) fn publications<T: DeserializeOwned>(&self) -> Result<Vec<T>, JournalError> {
+        let entries = self.store.get()?.publications.iter();
+        entries.map(|entry| decoded("a publication", &entry.value()?)).collect()
+    }
+
+    /// Writes publications by their revisions; they are on the disk when this returns.
+    pub(crate) fn put_publications(&self, told: Vec<(u64, Vec<u8>)>) -> Result<(), JournalError> {
+        let store = self.store.get()?;
+        let mut batch = store.batch();
+        for (revision, told) in told {
+            batch.batch.insert(&store.publications, revision.to_be_bytes(), told);
+        }
+        batch.commit()
     }
 
     /// Writes what a session says of cells, in the place of what it said before, and removes what it says of others.
@@ -248,9 +276,13 @@ impl StoreBatch<'_> {
         if let Some(lines) = write.lines {
             self.batch.insert(&self.store.cell_lines, cell.to_key(), lines);
         }
-        if let Some(NewVersion { version, published_ms, bytes }) = write.version {
+        if let Some(NewVersion { version, published_ms, bytes, revision, publication }) = write.version {
             let value = [published_ms.to_be_bytes().as_slice(), &bytes].concat();
             self.batch.insert(&self.store.cell_versions, versioned(cell, version), value);
+            self.batch.insert(&self.store.publications, revision.to_be_bytes(), publication);
+        }
+        for revision in write.outdated_revisions {
+            self.batch.remove(&self.store.publications, revision.to_be_bytes());
         }
         for version in write.outdated {
             self.batch.remove(&self.store.cell_versions, versioned(cell, version));
@@ -280,7 +312,7 @@ impl StoreBatch<'_> {
 }
 
 impl Store {
-    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 7] {
+    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 8] {
         [
             &self.contributions,
             &self.contribution_facts,
@@ -289,6 +321,7 @@ impl Store {
             &self.cell_lines,
             &self.cell_versions,
             &self.cell_purges,
+            &self.publications,
         ]
     }
 }

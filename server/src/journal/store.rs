@@ -64,6 +64,7 @@ pub(super) struct Store {
     pub(super) cell_lines: Keyspace,
     pub(super) cell_versions: Keyspace,
     pub(super) cell_purges: Keyspace,
+    pub(super) publications: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
@@ -100,6 +101,7 @@ impl Store {
             cell_lines: keyspace("cell_lines", MAX_MEMTABLE_BYTES)?,
             cell_versions: keyspace("cell_versions", MAX_MEMTABLE_BYTES)?,
             cell_purges: keyspace("cell_purges", MAX_SMALL_MEMTABLE_BYTES)?,
+            publications: keyspace("publications", MAX_SMALL_MEMTABLE_BYTES)?,
             folder: folder.to_owned(),
             database,
         })

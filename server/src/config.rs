@@ -11,10 +11,12 @@ use thiserror::Error;
 
 use crate::{auth::exposure, privacy::TripCut};
 
+mod base_path;
 mod credentials;
 mod overrides;
 mod zenoh;
 
+pub use base_path::{BasePath, BasePathError};
 pub use overrides::ConfigOverrides;
 pub use zenoh::{EndpointError, Endpoints, ModeError, ZenohMode};
 
@@ -50,6 +52,20 @@ pub struct ServerConfig {
     pub token_audience: String,
     /// Let anybody read maps and metrics, where others show who they are.
     pub anonymous_read: bool,
+    /// Path under which a proxy serves the service, e.g. `/maps`: links begin with it. Requests may come with it or
+    /// without.
+    pub base_path: BasePath,
+    /// Make links of what the headers `Forwarded`, `X-Forwarded-Proto`, `X-Forwarded-Host` and `X-Forwarded-Prefix` say:
+    /// only behind a proxy that sets them, for else any client could.
+    pub trust_forwarded_headers: bool,
+    /// Longest that the answer to a request over HTTP may take to begin, seconds, at least 1; then it is a 503.
+    pub request_timeout_s: u64,
+    /// Longest that the headers of a request may take to come, seconds, at least 1; then the connection is closed.
+    pub header_timeout_s: u64,
+    /// Longest path and query of a request, bytes, 256 to 65,000; a longer one is refused with 414.
+    pub max_url_bytes: usize,
+    /// Largest headers of a request, together, bytes, 1 KiB to 1 MiB; larger ones are refused with 431.
+    pub max_header_bytes: usize,
     /// Folder of the embedded store; created where it does not exist.
     pub data_dir: PathBuf,
     /// What the server is in zenoh: `off`, a `router` to which vehicles connect, or a `client` of one.
@@ -127,6 +143,8 @@ pub struct ServerConfig {
     pub cell_versions_kept_s: u64,
     /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for.
     pub max_cached_cell_bytes: usize,
+    /// Memory for cells as they are written for readers (GeoJSON), bytes; those not in it are written anew when asked for.
+    pub max_cached_feature_bytes: usize,
     /// Time between pings that find dead connections, seconds, at least 1.
     pub keep_alive_s: u64,
     /// Longest that a stream may be open before it names its drive, seconds.
@@ -169,6 +187,12 @@ impl Default for ServerConfig {
             token_issuer: None,
             token_audience: "lanemap".to_owned(),
             anonymous_read: false,
+            base_path: BasePath::default(),
+            trust_forwarded_headers: false,
+            request_timeout_s: 30,
+            header_timeout_s: 30,
+            max_url_bytes: 8192,
+            max_header_bytes: 32 * 1024,
             data_dir: PathBuf::from("lanemap-data"),
             zenoh_mode: ZenohMode::Off,
             zenoh_listen: Endpoints::loopback(),
@@ -205,6 +229,7 @@ impl Default for ServerConfig {
             max_contributions_per_cell: 256,
             cell_versions_kept_s: 3600,
             max_cached_cell_bytes: 128 * 1024 * 1024,
+            max_cached_feature_bytes: 128 * 1024 * 1024,
             keep_alive_s: 20,
             start_wait_s: 10,
             drain_delay_ms: 0,
@@ -318,6 +343,11 @@ impl ServerConfig {
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
         within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;
         within("max_cached_cell_bytes", self.max_cached_cell_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
+        within("max_cached_feature_bytes", self.max_cached_feature_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
+        within("request_timeout_s", self.request_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("header_timeout_s", self.header_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("max_url_bytes", self.max_url_bytes as f64, 256.0, 65_000.0, "256 ..= 65000")?;
+        within("max_header_bytes", self.max_header_bytes as f64, 1024.0, 1_048_576.0, "1024 ..= 1048576")?;
         within("keep_alive_s", self.keep_alive_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("start_wait_s", self.start_wait_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("drain_delay_ms", self.drain_delay_ms as f64, 0.0, 600_000.0, "0 ..= 600000")?;
@@ -383,6 +413,14 @@ impl ServerConfig {
 
     pub(crate) fn start_wait(&self) -> Duration {
         Duration::from_secs(self.start_wait_s)
+    }
+
+    pub(crate) fn request_timeout(&self) -> Duration {
+        Duration::from_secs(self.request_timeout_s)
+    }
+
+    pub(crate) fn header_timeout(&self) -> Duration {
+        Duration::from_secs(self.header_timeout_s)
     }
 
     pub(crate) fn keep_alive(&self) -> Duration {

@@ -1,6 +1,8 @@
 //! One port for gRPC and HTTP: accepts connections, bounded in number, shakes hands with each in a task of its own, and
 //! ends them gracefully.
 
+mod first_bytes;
+
 use std::{sync::Arc, time::Duration};
 
 use axum::{Extension, Router};
@@ -28,10 +30,21 @@ use crate::{
     config::ServerConfig,
     telemetry,
 };
+use first_bytes::FirstBytes;
 use tower::Layer;
 
 /// Pause after a failed accept: out of file descriptors, most likely.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// Least room for what a connection reads at a time, bytes.
+const LEAST_BUFFER_BYTES: usize = 64 * 1024;
+
+/// How connections are spoken with.
+struct Protocol {
+    builder: Builder<TokioExecutor>,
+    /// Time for the bytes that tell which version of HTTP a connection speaks.
+    first_bytes: Duration,
+}
 
 /// Accepts connections until `stop`, then lets those that are open end until `deadline`.
 pub(crate) async fn serve(
@@ -42,7 +55,7 @@ pub(crate) async fn serve(
     stop: CancellationToken,
     deadline: impl Future<Output = ()>,
 ) {
-    let builder = Arc::new(connection_builder(config));
+    let protocol = Arc::new(Protocol { builder: connection_builder(config), first_bytes: config.header_timeout() });
     let graceful = GracefulShutdown::new();
     let abort = CancellationToken::new();
     let places = Arc::new(Semaphore::new(config.max_connections));
@@ -53,7 +66,7 @@ pub(crate) async fn serve(
         };
         let Some((connection, place)) = accepted else { continue };
         let serving =
-            serve_connection(connection, router.clone(), Arc::clone(&builder), tls.clone(), graceful.watcher());
+            serve_connection(connection, router.clone(), Arc::clone(&protocol), tls.clone(), graceful.watcher());
         let abort = abort.clone();
         tokio::spawn(async move {
             metrics::gauge!(telemetry::CONNECTIONS).increment(1.0);
@@ -100,17 +113,17 @@ async fn accept(
 async fn serve_connection(
     connection: TcpStream,
     router: Router,
-    builder: Arc<Builder<TokioExecutor>>,
+    protocol: Arc<Protocol>,
     tls: Option<Arc<Tls>>,
     watcher: Watcher,
 ) {
     let Some(tls) = tls else {
-        return serve_requests(connection, Connection { identity: None }, router, &builder, watcher).await;
+        return serve_requests(connection, Connection { identity: None }, router, &protocol, watcher).await;
     };
     match tls.accept(connection).await {
         Ok(stream) => {
             let identity = tls::identity(&stream).map(Arc::new);
-            serve_requests(stream, Connection { identity }, router, &builder, watcher).await;
+            serve_requests(stream, Connection { identity }, router, &protocol, watcher).await;
         }
         Err(error) => {
             tracing::debug!(%error, "a connection did not come about");
@@ -123,11 +136,12 @@ async fn serve_requests(
     stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
     connection: Connection,
     router: Router,
-    builder: &Builder<TokioExecutor>,
+    protocol: &Protocol,
     watcher: Watcher,
 ) {
     let service = TowerToHyperService::new(Extension(connection).layer(router));
-    let serving = builder.serve_connection_with_upgrades(TokioIo::new(stream), service).into_owned();
+    let stream = TokioIo::new(FirstBytes::within(protocol.first_bytes, stream));
+    let serving = protocol.builder.serve_connection_with_upgrades(stream, service).into_owned();
     if let Err(error) = watcher.watch(serving).await {
         tracing::debug!(error, "a connection broke");
     }
@@ -136,9 +150,12 @@ async fn serve_requests(
 fn connection_builder(config: &ServerConfig) -> Builder<TokioExecutor> {
     let mut builder = Builder::new(TokioExecutor::new());
     let streams = u32::try_from(config.max_streams_per_connection).unwrap_or(u32::MAX);
-    builder.http1().timer(TokioTimer::new()).header_read_timeout(Duration::from_secs(30));
+    // Wider than the router's own bounds, whose refusals say what is wrong; beyond these the connection ends.
+    let header_bytes = LEAST_BUFFER_BYTES.max(2 * (config.max_header_bytes + config.max_url_bytes));
+    builder.http1().timer(TokioTimer::new()).header_read_timeout(config.header_timeout()).max_buf_size(header_bytes);
     builder
         .http2()
+        .max_header_list_size(u32::try_from(header_bytes).unwrap_or(u32::MAX))
         .timer(TokioTimer::new())
         .max_concurrent_streams(streams)
         .keep_alive_interval(config.keep_alive())

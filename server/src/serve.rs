@@ -21,11 +21,14 @@
 pub mod bounds;
 mod cells;
 mod drive_items;
+mod encoding;
 pub mod entity_tag;
 pub mod extents;
 pub mod features;
 mod items;
+mod limits;
 pub mod line;
+pub mod link_base;
 mod operation;
 mod page;
 pub mod problem;
@@ -36,6 +39,8 @@ mod sessions;
 mod shared_lanes;
 mod splines;
 mod viewer;
+
+use std::{sync::Arc, time::Duration};
 
 use axum::{
     Router,
@@ -48,16 +53,18 @@ use axum::{
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
-use tower_http::{
-    compression::CompressionLayer,
-    cors::{AllowHeaders, CorsLayer},
-};
+use tower_http::cors::{AllowHeaders, CorsLayer};
 
 use self::{
     extents::Extents,
+    limits::Limits,
+    link_base::{LinkBase, LinkSettings},
     problem::{Problem, repeated},
 };
-use crate::{auth::layer::require_read, fuse::SharedMap, session::Sessions};
+use crate::{auth::layer::require_read, config::ServerConfig, fuse::SharedMap, session::Sessions};
+
+/// Time for which a browser need not ask again whether it may ask.
+const ONE_DAY: Duration = Duration::from_hours(24);
 
 /// What the HTTP handlers read.
 #[derive(Clone)]
@@ -72,6 +79,8 @@ pub struct ServeState {
     pub ready: watch::Receiver<Readiness>,
     /// Cancelled when the service shuts down: answers that stay open (server-sent events) must end.
     pub shutdown: CancellationToken,
+    /// The settings.
+    pub config: Arc<ServerConfig>,
 }
 
 /// Whether the service takes traffic.
@@ -88,6 +97,13 @@ pub enum Readiness {
 struct Shared {
     state: ServeState,
     extents: Extents,
+    links: LinkSettings,
+}
+
+impl FromRef<Shared> for LinkSettings {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.links.clone()
+    }
 }
 
 impl FromRef<Shared> for ServeState {
@@ -107,6 +123,7 @@ impl FromRef<Shared> for Extents {
 ///
 /// Maps and metrics are for those who may read them; the viewer's page, which holds none, and health are for all.
 pub fn router(state: ServeState) -> Router {
+    let (links, limits) = (LinkSettings::of(&state.config), Arc::new(Limits::of(&state.config)));
     let readers = Router::new()
         .route("/sessions", get(sessions::list))
         .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
@@ -125,17 +142,26 @@ pub fn router(state: ServeState) -> Router {
     Router::new()
         .merge(readers)
         .route("/viewer", get(viewer::page))
-        .route("/viewer/", get(|| async { Redirect::permanent("/viewer") }))
+        .route("/viewer/", get(|base: LinkBase| async move { Redirect::permanent(&base.link("/viewer")) }))
         .route("/viewer/{name}", get(viewer::file))
         .route("/healthz", get(operation::healthz))
         .route("/readyz", get(operation::readyz))
         .fallback(no_such_path)
         .method_not_allowed_fallback(method_not_allowed)
-        .layer(CompressionLayer::new())
-        .layer(middleware::from_fn(entity_tag::tell_compressed_apart))
-        // A `*` for headers would leave out `authorization`: browsers want it by name.
-        .layer(CorsLayer::permissive().allow_headers(AllowHeaders::mirror_request()).expose_headers([header::ETAG]))
-        .with_state(Shared { state, extents: Extents::default() })
+        .layer(encoding::layer())
+        .layer(middleware::from_fn(encoding::tell_apart))
+        .layer(middleware::from_fn_with_state(limits, limits::keep))
+        .layer(middleware::from_fn(limits::head_as_get))
+        .layer(cross_origin())
+        .with_state(Shared { state, extents: Extents::default(), links })
+}
+
+/// Pages of any origin may read what its user may.
+fn cross_origin() -> CorsLayer {
+    let told = [header::ETAG, header::LINK, header::ALLOW, header::RETRY_AFTER, header::WWW_AUTHENTICATE];
+    // A `*` for headers would leave out `authorization`: browsers want it by name. Answers are the same for every origin,
+    // so that they vary with none.
+    CorsLayer::permissive().allow_headers(AllowHeaders::mirror_request()).expose_headers(told).vary([]).max_age(ONE_DAY)
 }
 
 /// HTTP status and a problem document for HTTP; for gRPC, which reads trailers only, its own "unimplemented".

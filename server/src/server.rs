@@ -31,7 +31,7 @@ use crate::{
     listener,
     map_service::MapGrpc,
     privacy::{KeyError, Pseudonyms},
-    serve::{self, Readiness, ServeState},
+    serve::{self, Readiness, ServeState, link_base},
     session::{Sessions, actor::Surroundings, in_flight::InFlightBudget, registry::SessionRegistry},
     telemetry,
 };
@@ -136,6 +136,7 @@ impl Server {
             metrics,
             ready: is_ready,
             shutdown: shutdown.clone(),
+            config: Arc::clone(&config),
         };
         let streams = TaskTracker::new();
         let conversations =
@@ -422,5 +423,6 @@ async fn router(
         .add_service(maps)
         .add_service(health)
         .add_service(reflection);
-    Ok((reporter, routes.into_axum_router().layer(middleware::from_fn(telemetry::requests::observe))))
+    let router = routes.into_axum_router().layer(middleware::from_fn(telemetry::requests::observe));
+    Ok((reporter, link_base::mounted(router, &config.base_path)))
 }

@@ -262,7 +262,7 @@ async fn a_forgotten_drive_is_gone_from_the_cells_and_from_their_past() {
     let refused = http::get(&since).await.unwrap();
     assert_eq!(refused.status(), StatusCode::GONE);
     let problem: Value = refused.json().await.unwrap();
-    assert_eq!(problem["alternate"], format!("/cells/{cell}/lanes.pb"));
+    assert_eq!(problem["alternate"], format!("{}/cells/{cell}/lanes.pb", server.url()));
 
     forget(&server.url(), &drives[1]).await;
     let nothing = cell_maps(&server.url()).await;

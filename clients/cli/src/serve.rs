@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 use lanemap_server::{
     ConfigOverrides, Server, ServerConfig,
-    config::{Endpoints, ZenohMode},
+    config::{BasePath, Endpoints, ZenohMode},
 };
 
 use crate::{logging, signal};
@@ -66,6 +66,30 @@ pub struct ServeArgs {
     /// [default: false]
     #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     anonymous_read: Option<bool>,
+    /// Path under which a proxy serves the service, e.g. /maps: links begin with it; requests may come with it or without
+    /// [env: LANEMAP_BASE_PATH] [default: ]
+    #[arg(long, value_name = "PATH")]
+    base_path: Option<BasePath>,
+    /// Make links of what the headers Forwarded and X-Forwarded-{Proto,Host,Prefix} say: only behind a proxy that sets
+    /// them [env: LANEMAP_TRUST_FORWARDED_HEADERS] [default: false]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    trust_forwarded_headers: Option<bool>,
+    /// Longest that the answer to a request over HTTP may take to begin, seconds; then it is a 503
+    /// [env: LANEMAP_REQUEST_TIMEOUT_S] [default: 30]
+    #[arg(long, value_name = "S")]
+    request_timeout_s: Option<u64>,
+    /// Longest that the headers of a request may take to come, seconds; then the connection is closed
+    /// [env: LANEMAP_HEADER_TIMEOUT_S] [default: 30]
+    #[arg(long, value_name = "S")]
+    header_timeout_s: Option<u64>,
+    /// Longest path and query of a request, bytes, 256 to 65,000; a longer one is refused
+    /// [env: LANEMAP_MAX_URL_BYTES] [default: 8192]
+    #[arg(long, value_name = "BYTES")]
+    max_url_bytes: Option<usize>,
+    /// Largest headers of a request, together, bytes; larger ones are refused
+    /// [env: LANEMAP_MAX_HEADER_BYTES] [default: 32768]
+    #[arg(long, value_name = "BYTES")]
+    max_header_bytes: Option<usize>,
     /// Folder of the embedded store; made where it does not exist [env: LANEMAP_DATA_DIR] [default: lanemap-data]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
@@ -200,6 +224,10 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
     max_cached_cell_bytes: Option<usize>,
+    /// Memory for cells as they are written for readers (GeoJSON), bytes; those not in it are written anew when asked for
+    /// [env: LANEMAP_MAX_CACHED_FEATURE_BYTES] [default: 134217728]
+    #[arg(long, value_name = "BYTES")]
+    max_cached_feature_bytes: Option<usize>,
     /// Time between pings that find dead connections, seconds [env: LANEMAP_KEEP_ALIVE_S] [default: 20]
     #[arg(long, value_name = "S")]
     keep_alive_s: Option<u64>,
@@ -252,6 +280,12 @@ impl ServeArgs {
             token_issuer: self.token_issuer.clone(),
             token_audience: self.token_audience.clone(),
             anonymous_read: self.anonymous_read,
+            base_path: self.base_path.clone(),
+            trust_forwarded_headers: self.trust_forwarded_headers,
+            request_timeout_s: self.request_timeout_s,
+            header_timeout_s: self.header_timeout_s,
+            max_url_bytes: self.max_url_bytes,
+            max_header_bytes: self.max_header_bytes,
             data_dir: self.data_dir.clone(),
             zenoh_mode: self.zenoh_mode,
             zenoh_listen: self.zenoh_listen.clone(),
@@ -288,6 +322,7 @@ impl ServeArgs {
             max_contributions_per_cell: self.max_contributions_per_cell,
             cell_versions_kept_s: self.cell_versions_kept_s,
             max_cached_cell_bytes: self.max_cached_cell_bytes,
+            max_cached_feature_bytes: self.max_cached_feature_bytes,
             keep_alive_s: self.keep_alive_s,
             start_wait_s: self.start_wait_s,
             drain_delay_ms: self.drain_delay_ms,

@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, path::PathBuf};
 
-use super::{Endpoints, ServerConfig, ZenohMode};
+use super::{BasePath, Endpoints, ServerConfig, ZenohMode};
 
 /// The settings of [`ServerConfig`], each of which may be unset.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -33,6 +33,18 @@ pub struct ConfigOverrides {
     pub token_audience: Option<String>,
     /// See [`ServerConfig::anonymous_read`].
     pub anonymous_read: Option<bool>,
+    /// See [`ServerConfig::base_path`].
+    pub base_path: Option<BasePath>,
+    /// See [`ServerConfig::trust_forwarded_headers`].
+    pub trust_forwarded_headers: Option<bool>,
+    /// See [`ServerConfig::request_timeout_s`].
+    pub request_timeout_s: Option<u64>,
+    /// See [`ServerConfig::header_timeout_s`].
+    pub header_timeout_s: Option<u64>,
+    /// See [`ServerConfig::max_url_bytes`].
+    pub max_url_bytes: Option<usize>,
+    /// See [`ServerConfig::max_header_bytes`].
+    pub max_header_bytes: Option<usize>,
     /// See [`ServerConfig::data_dir`].
     pub data_dir: Option<PathBuf>,
     /// See [`ServerConfig::zenoh_mode`].
@@ -105,6 +117,8 @@ pub struct ConfigOverrides {
     pub cell_versions_kept_s: Option<u64>,
     /// See [`ServerConfig::max_cached_cell_bytes`].
     pub max_cached_cell_bytes: Option<usize>,
+    /// See [`ServerConfig::max_cached_feature_bytes`].
+    pub max_cached_feature_bytes: Option<usize>,
     /// See [`ServerConfig::keep_alive_s`].
     pub keep_alive_s: Option<u64>,
     /// See [`ServerConfig::start_wait_s`].
@@ -140,6 +154,12 @@ impl ConfigOverrides {
         set_optional(&mut settings.token_issuer, self.token_issuer);
         set(&mut settings.token_audience, self.token_audience);
         set(&mut settings.anonymous_read, self.anonymous_read);
+        set(&mut settings.base_path, self.base_path);
+        set(&mut settings.trust_forwarded_headers, self.trust_forwarded_headers);
+        set(&mut settings.request_timeout_s, self.request_timeout_s);
+        set(&mut settings.header_timeout_s, self.header_timeout_s);
+        set(&mut settings.max_url_bytes, self.max_url_bytes);
+        set(&mut settings.max_header_bytes, self.max_header_bytes);
         set(&mut settings.data_dir, self.data_dir);
         set(&mut settings.zenoh_mode, self.zenoh_mode);
         set(&mut settings.zenoh_listen, self.zenoh_listen);
@@ -176,6 +196,7 @@ impl ConfigOverrides {
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
         set(&mut settings.max_cached_cell_bytes, self.max_cached_cell_bytes);
+        set(&mut settings.max_cached_feature_bytes, self.max_cached_feature_bytes);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
         set(&mut settings.start_wait_s, self.start_wait_s);
         set(&mut settings.drain_delay_ms, self.drain_delay_ms);

@@ -20,6 +20,7 @@ use super::{
     in_background,
     items::of_cell,
     line::rounded,
+    link_base::LinkBase,
     problem::{Problem, repeated},
     query::{Parameters, parse_limit},
     sessions::{GEOJSON, Link, PROTOBUF},
@@ -84,7 +85,12 @@ struct Changes {
 }
 
 /// `GET /cells`
-pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+pub(super) async fn list(
+    State(state): State<ServeState>,
+    base: LinkBase,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
     let parameters = Parameters::read(&uri, &["limit", "after"])?;
     let limit = parameters.get("limit", |text| parse_limit(text, MOST_CELLS))?.unwrap_or(DEFAULT_LIMIT);
     let after = parameters.get("after", |text| text.parse::<CellId>().map_err(|error| error.to_string()))?;
@@ -95,15 +101,15 @@ pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: Hea
     let more = cells.len() > limit;
     cells.truncate(limit);
     let parts: Vec<_> = cells.iter().map(|(cell, record)| identity(*cell, record, &state.map)).collect();
-    let tag = EntityTag::of((total, settled, limit, more, parts));
+    let tag = EntityTag::of((total, settled, limit, more, parts, &base));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let entries: Vec<Entry> = cells.iter().map(|(cell, record)| entry(*cell, record, &state.map)).collect();
+    let entries: Vec<Entry> = cells.iter().map(|(cell, record)| entry(*cell, record, &state.map, &base)).collect();
     let next = entries.last().filter(|_| more).map(|last| Link {
         rel: "next",
         media_type: "application/json",
-        href: format!("/cells?limit={limit}&after={}", last.id),
+        href: base.link(&format!("/cells?limit={limit}&after={}", last.id)),
     });
     Ok(tag.on(Json(CellList { total, settled, links: next.into_iter().collect(), cells: entries })))
 }
@@ -111,17 +117,18 @@ pub(super) async fn list(State(state): State<ServeState>, uri: Uri, headers: Hea
 /// `GET /cells/{id}`
 pub(super) async fn one(
     State(state): State<ServeState>,
+    base: LinkBase,
     Path(id): Path<String>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     Parameters::read(&uri, &[])?;
     let (cell, record) = known(&state.map, &id)?;
-    let tag = EntityTag::of(identity(cell, &record, &state.map));
+    let tag = EntityTag::of((identity(cell, &record, &state.map), &base));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    Ok(tag.on(Json(entry(cell, &record, &state.map))))
+    Ok(tag.on(Json(entry(cell, &record, &state.map, &base))))
 }
 
 /// `GET /cells/{id}/lanes.geojson`
@@ -160,11 +167,12 @@ pub(super) async fn lanes_protobuf(
 /// `GET /cells/{id}/changes`
 pub(super) async fn changes_json(
     State(state): State<ServeState>,
+    base: LinkBase,
     Path(id): Path<String>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let (cell, changes) = changes(&state.map, &id, &uri).await?;
+    let (cell, changes) = changes(&state.map, &base, &id, &uri).await?;
     let tag = EntityTag::of((cell, changes.from_version, changes.to_version));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
@@ -175,11 +183,12 @@ pub(super) async fn changes_json(
 /// `GET /cells/{id}/changes.pb`
 pub(super) async fn changes_protobuf(
     State(state): State<ServeState>,
+    base: LinkBase,
     Path(id): Path<String>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let (cell, changes) = changes(&state.map, &id, &uri).await?;
+    let (cell, changes) = changes(&state.map, &base, &id, &uri).await?;
     let tag = EntityTag::of((cell, changes.from_version, changes.to_version));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
@@ -192,9 +201,9 @@ fn identity(cell: CellId, record: &CellRecord, map: &SharedMap) -> (CellId, u64,
     (cell, record.version.0, record.fused_at_ms, map.is_dirty(cell))
 }
 
-fn entry(cell: CellId, record: &CellRecord, map: &SharedMap) -> Entry {
+fn entry(cell: CellId, record: &CellRecord, map: &SharedMap, base: &LinkBase) -> Entry {
     let id = cell.to_string();
-    let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("/cells/{id}/{tail}") };
+    let link = |rel, media_type, tail: &str| Link { rel, media_type, href: base.link(&format!("/cells/{id}/{tail}")) };
     let fused_at = i64::try_from(record.fused_at_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
     Entry {
         version: record.version.0,
@@ -233,7 +242,7 @@ async fn published(map: &SharedMap, id: &str) -> Result<(CellId, Arc<PublishedCe
     Ok((cell, found.ok_or_else(|| no_such_cell(id))?))
 }
 
-async fn changes(map: &SharedMap, id: &str, uri: &Uri) -> Result<(CellId, v1::CellChanges), Problem> {
+async fn changes(map: &SharedMap, base: &LinkBase, id: &str, uri: &Uri) -> Result<(CellId, v1::CellChanges), Problem> {
     let whole_number = |text: &str| text.parse().map_err(|_| "it must be a version, a whole number".to_owned());
     let since = Parameters::read(uri, &["since"])?.get("since", whole_number)?.unwrap_or(0);
     let (cell, _) = known(map, id)?;
@@ -242,7 +251,8 @@ async fn changes(map: &SharedMap, id: &str, uri: &Uri) -> Result<(CellId, v1::Ce
     let refused = |error: ChangesError| match error {
         ChangesError::NoSuchCell { .. } => no_such_cell(id),
         ChangesError::NotKept { .. } => {
-            Problem::VersionNotKept { reason: error.to_string(), whole: format!("/cells/{cell}/lanes.pb") }
+            let whole = base.link(&format!("/cells/{cell}/lanes.pb"));
+            Problem::VersionNotKept { reason: error.to_string(), whole }
         }
         ChangesError::Store(error) => error.into(),
     };

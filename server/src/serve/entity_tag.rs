@@ -1,27 +1,30 @@
 //! Strong entity tags and conditional requests (RFC 9110, 8.8.3 and 13.1.2).
 //!
 //! A tag is the hash of what an answer is made of (versions of maps, the query, the build), so it is known, and a 304
-//! given, before the answer is made. A compressed answer is another representation: it carries the tag with `-gzip`
-//! appended, and either form is understood when it comes back.
+//! given, before the answer is made. A compressed answer is another representation: it carries the tag with the name of its
+//! encoding appended. An answer that tells when it was made carries that time, too: two that were made of the same at
+//! different times differ in it and in their tags, and either is up to date as long as what they are made of is.
 
 use std::{
     fmt,
     hash::{DefaultHasher, Hash, Hasher},
+    time::{SystemTime, UNIX_EPOCH},
 };
 
 use axum::{
-    extract::Request,
     http::{HeaderMap, HeaderValue, StatusCode, header},
-    middleware::Next,
     response::{IntoResponse, Response},
 };
 
-/// The tag of an uncompressed answer.
+/// The tag of an uncompressed answer, without its quotes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct EntityTag(String);
+pub struct EntityTag {
+    hash: u64,
+    made_at_us: Option<u64>,
+}
 
-/// What a compressed answer's tag has before its closing quote.
-const COMPRESSED: &str = "-gzip";
+/// Encodings that have tags of their own.
+const ENCODINGS: [&str; 3] = ["gzip", "br", "zstd"];
 
 impl EntityTag {
     /// The tag of an answer that is a function of `parts` and of this build.
@@ -30,19 +33,22 @@ impl EntityTag {
         let mut hasher = DefaultHasher::new();
         env!("CARGO_PKG_VERSION").hash(&mut hasher);
         parts.hash(&mut hasher);
-        Self(format!("\"{:016x}\"", hasher.finish()))
+        Self { hash: hasher.finish(), made_at_us: None }
     }
 
-    /// Whether the request's `If-None-Match` names this tag.
+    /// The tag of an answer that also tells that it is made now; and now, microseconds since the Unix epoch.
+    #[must_use]
+    pub fn made_now(self) -> (Self, u64) {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
+        (Self { made_at_us: Some(now_us), ..self }, now_us)
+    }
+
+    /// Whether the request's `If-None-Match` names this tag, in any encoding, made at any time.
     #[must_use]
     pub fn is_held_by(&self, request: &HeaderMap) -> bool {
-        request
-            .get_all(header::IF_NONE_MATCH)
-            .iter()
-            .filter_map(|value| value.to_str().ok())
-            .flat_map(|value| value.split(','))
-            .map(str::trim)
-            .any(|held| held == "*" || uncompressed(held) == self.0)
+        let tag = self.to_string();
+        held(request).iter().any(|held| held == "*" || are_of_one(held, &tag))
     }
 
     /// The answer to a request that already holds it.
@@ -56,39 +62,47 @@ impl EntityTag {
     pub fn on(&self, answer: impl IntoResponse) -> Response {
         let mut response = answer.into_response();
         let headers = response.headers_mut();
-        if let Ok(value) = HeaderValue::from_str(&self.0) {
+        if let Ok(value) = HeaderValue::from_str(&self.to_string()) {
             headers.insert(header::ETAG, value);
         }
         headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-        headers.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
+        headers.append(header::VARY, HeaderValue::from_static("accept-encoding"));
         response
     }
 }
 
 impl fmt::Display for EntityTag {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(formatter)
-    }
-}
-
-/// A tag without the mark of compression and of weakness (`If-None-Match` compares weakly).
-fn uncompressed(tag: &str) -> String {
-    tag.trim_start_matches("W/").replace(&format!("{COMPRESSED}\""), "\"")
-}
-
-/// Outside the compression layer: tells the tag of a compressed answer from that of the plain one.
-pub async fn tell_compressed_apart(request: Request, next: Next) -> Response {
-    let mut response = next.run(request).await;
-    if response.headers().contains_key(header::CONTENT_ENCODING) {
-        let compressed = response.headers().get(header::ETAG).and_then(|tag| tag.to_str().ok()).and_then(|tag| {
-            let inner = tag.strip_suffix('"')?;
-            HeaderValue::from_str(&format!("{inner}{COMPRESSED}\"")).ok()
-        });
-        if let Some(tag) = compressed {
-            response.headers_mut().insert(header::ETAG, tag);
+        write!(formatter, "\"{:016x}", self.hash)?;
+        if let Some(made_at_us) = self.made_at_us {
+            write!(formatter, ".{made_at_us:x}")?;
         }
+        formatter.write_str("\"")
     }
-    response
+}
+
+/// The tags of a request's `If-None-Match`, without the mark of weakness: it compares weakly.
+pub(super) fn held(request: &HeaderMap) -> Vec<String> {
+    let values = request.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
+    let tags = values.flat_map(|value| value.split(',')).map(|tag| tag.trim().trim_start_matches("W/").to_owned());
+    tags.collect()
+}
+
+/// Whether two tags are of answers made of the same, whatever their encoding and time.
+pub(super) fn are_of_one(one: &str, other: &str) -> bool {
+    let made_of = |tag: &str| {
+        let inner = tag.strip_prefix('"')?.strip_suffix('"')?;
+        let plain = ENCODINGS.iter().find_map(|encoding| inner.strip_suffix(encoding)?.strip_suffix('-'));
+        let plain = plain.unwrap_or(inner);
+        Some(plain.split_once('.').map_or(plain, |(hash, _)| hash).to_owned())
+    };
+    made_of(one).is_some_and(|parts| made_of(other) == Some(parts))
+}
+
+/// The tag of the same answer in an encoding; `None` where that has none of its own.
+pub(super) fn encoded(tag: &str, encoding: &str) -> Option<String> {
+    ENCODINGS.contains(&encoding).then_some(())?;
+    Some(format!("{}-{encoding}\"", tag.strip_suffix('"')?))
 }
 
 #[cfg(test)]
@@ -102,10 +116,17 @@ mod tests {
     #[test]
     fn a_tag_is_known_again_plain_compressed_weak_and_in_a_list() {
         let tag = EntityTag::of(("session", 7));
-        let compressed = format!("{}-gzip\"", tag.to_string().trim_end_matches('"'));
-        for held in
-            [tag.to_string(), compressed.clone(), format!("W/{tag}"), format!("\"other\", {compressed}"), "*".into()]
-        {
+        let compressed = encoded(&tag.to_string(), "br").unwrap();
+        let (made_now, _) = tag.clone().made_now();
+        for held in [
+            tag.to_string(),
+            compressed.clone(),
+            format!("W/{tag}"),
+            format!("\"other\", {compressed}"),
+            "*".into(),
+            made_now.to_string(),
+            encoded(&made_now.to_string(), "zstd").unwrap(),
+        ] {
             assert!(tag.is_held_by(&holding(&held)), "{held}");
         }
         assert!(!tag.is_held_by(&holding("\"other\"")));

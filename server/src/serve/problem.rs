@@ -65,6 +65,8 @@ pub enum Problem {
     NotGeoreferenced {
         /// The session.
         session: SessionId,
+        /// Address of its lanes in metres.
+        local: String,
     },
     /// A query parameter that the address does not know.
     #[error("parameter {name:?} is not known here; known: {known}")]
@@ -95,6 +97,64 @@ pub enum Problem {
     BadQuery {
         /// What is wrong.
         reason: String,
+    },
+    /// No form of the answer is one that the request takes.
+    #[error("no form of this answer is acceptable: {reason}")]
+    NotAcceptable {
+        /// What the request takes, and what there is.
+        reason: String,
+    },
+    /// The path and query are too long.
+    #[error("path and query have {bytes} bytes, and may have {most}")]
+    UrlTooLong {
+        /// Their length.
+        bytes: usize,
+        /// The most that is taken.
+        most: usize,
+    },
+    /// The headers are too large.
+    #[error("the headers have {bytes} bytes, and may have {most}")]
+    HeadersTooLarge {
+        /// Their size.
+        bytes: usize,
+        /// The most that is taken.
+        most: usize,
+    },
+    /// The body is too large.
+    #[error("the body has {bytes} bytes, and may have {most}; no address here takes one")]
+    BodyTooLarge {
+        /// Its length.
+        bytes: u64,
+        /// The most that is taken.
+        most: u64,
+    },
+    /// The answer was not there in time.
+    #[error("the answer was not there after {after_s} s; ask for less at a time, or again later")]
+    Overdue {
+        /// The time that it had, seconds.
+        after_s: u64,
+    },
+    /// The address names a collection that is not there.
+    #[error("there is no collection {collection:?}; /collections lists those that there are")]
+    NoSuchCollection {
+        /// The name in the address.
+        collection: String,
+    },
+    /// The address names a feature that is not there.
+    #[error("there is no feature {feature:?} in {collection}")]
+    NoSuchFeature {
+        /// The collection.
+        collection: &'static str,
+        /// The name in the address.
+        feature: String,
+    },
+    /// A page was asked for of a version of the map that is not kept.
+    #[error("{reason}; begin anew with the first page")]
+    WalkOver {
+        /// Which versions are.
+        reason: String,
+        /// Address of the first page.
+        first: String,
     },
     /// The request does not show who sends it, or not in a way that is taken.
     #[error("{0}")]
@@ -138,8 +198,15 @@ impl Problem {
             Self::NoSuchPath { .. }
             | Self::NoSuchSession { .. }
             | Self::NoSuchCell { .. }
-            | Self::NoSuchTile { .. } => StatusCode::NOT_FOUND,
-            Self::VersionNotKept { .. } => StatusCode::GONE,
+            | Self::NoSuchTile { .. }
+            | Self::NoSuchCollection { .. }
+            | Self::NoSuchFeature { .. } => StatusCode::NOT_FOUND,
+            Self::VersionNotKept { .. } | Self::WalkOver { .. } => StatusCode::GONE,
+            Self::NotAcceptable { .. } => StatusCode::NOT_ACCEPTABLE,
+            Self::UrlTooLong { .. } => StatusCode::URI_TOO_LONG,
+            Self::HeadersTooLarge { .. } => StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE,
+            Self::BodyTooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
+            Self::Overdue { .. } => StatusCode::SERVICE_UNAVAILABLE,
             Self::MethodNotAllowed { .. } => StatusCode::METHOD_NOT_ALLOWED,
             Self::NotGeoreferenced { .. } => StatusCode::CONFLICT,
             Self::Unauthenticated(_) => StatusCode::UNAUTHORIZED,
@@ -181,6 +248,14 @@ impl Problem {
             Self::RepeatedParameter { .. } => ("repeated-parameter", "Repeated query parameter"),
             Self::BadParameter { .. } => ("bad-parameter", "Malformed query parameter"),
             Self::BadQuery { .. } => ("bad-query", "Malformed query"),
+            Self::NotAcceptable { .. } => ("not-acceptable", "Not acceptable"),
+            Self::UrlTooLong { .. } => ("url-too-long", "Path and query too long"),
+            Self::HeadersTooLarge { .. } => ("headers-too-large", "Headers too large"),
+            Self::BodyTooLarge { .. } => ("body-too-large", "Body too large"),
+            Self::Overdue { .. } => ("overdue", "The answer takes too long"),
+            Self::NoSuchCollection { .. } => ("no-such-collection", "No such collection"),
+            Self::NoSuchFeature { .. } => ("no-such-feature", "No such feature"),
+            Self::WalkOver { .. } => ("walk-over", "The version of the map is not kept"),
             Self::Unauthenticated(_) => ("unauthenticated", "Unauthenticated"),
             Self::NotPermitted(_) => ("not-permitted", "Not permitted"),
             Self::Internal => ("internal", "Internal error"),
@@ -200,8 +275,9 @@ impl Problem {
                 _ => None,
             },
             alternate: match self {
-                Self::NotGeoreferenced { session } => Some(format!("/sessions/{session}/lanes.geojson?crs=local")),
+                Self::NotGeoreferenced { local, .. } => Some(local.clone()),
                 Self::VersionNotKept { whole, .. } => Some(whole.clone()),
+                Self::WalkOver { first, .. } => Some(first.clone()),
                 _ => None,
             },
         }
@@ -216,6 +292,9 @@ impl IntoResponse for Problem {
             (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
         ];
         let mut response = (self.status(), headers, body).into_response();
+        if matches!(self, Self::Overdue { .. }) {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("1"));
+        }
         if let Some(challenge) = self.challenge() {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, challenge);
         }
@@ -251,10 +330,12 @@ mod tests {
     #[test]
     fn a_session_off_the_earth_is_refused_with_the_address_of_its_metres() {
         let session = SessionId::next(None, 0, 1);
-        let document = serde_json::to_value(Problem::NotGeoreferenced { session }.document()).unwrap();
+        let local = format!("/sessions/{session}/lanes.geojson?crs=local");
+        let document =
+            serde_json::to_value(Problem::NotGeoreferenced { session, local: local.clone() }.document()).unwrap();
         assert_eq!(document["status"], 409);
         assert_eq!(document["type"], "urn:lanemap:problem:not-georeferenced");
-        assert_eq!(document["alternate"], format!("/sessions/{session}/lanes.geojson?crs=local"));
+        assert_eq!(document["alternate"], local);
     }
 
     #[test]

@@ -20,6 +20,7 @@ use super::{
     features::{Crs, rfc3339, session_lanes},
     in_background,
     line::{Coordinate, in_metres, rounded, written},
+    link_base::LinkBase,
     problem::{Problem, repeated},
     query::{Parameters, parse_limit},
 };
@@ -92,6 +93,7 @@ struct Vehicle {
 pub(super) async fn list(
     State(state): State<ServeState>,
     State(extents): State<Extents>,
+    base: LinkBase,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
@@ -110,17 +112,17 @@ pub(super) async fn list(
         cells.iter().flat_map(|(_, record)| record.kept_apart.iter().copied()).collect();
     let apart = |map: &SessionSummary| kept_apart.contains(&map.session);
     let parts: Vec<_> = maps.iter().map(|map| (identity(map), map.state as u8, apart(map))).collect();
-    let tag = EntityTag::of((total, limit, more, parts));
+    let tag = EntityTag::of((total, limit, more, parts, &base));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
     let page = in_background(move || {
-        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents, &kept_apart)).collect();
+        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents, &kept_apart, &base)).collect();
         let last = sessions.last().filter(|_| more);
         let next = last.map(|last| Link {
             rel: "next",
             media_type: "application/json",
-            href: format!("/sessions?limit={limit}&after={}", last.id),
+            href: base.link(&format!("/sessions?limit={limit}&after={}", last.id)),
         });
         SessionList { total, links: next.into_iter().collect(), sessions }
     });
@@ -132,13 +134,13 @@ pub(super) fn identity(map: &SessionSummary) -> (u64, u64, bool) {
     (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
 }
 
-fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionId>) -> Entry {
-    let path = format!("/sessions/{}", map.session);
+fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionId>, base: &LinkBase) -> Entry {
+    let path = base.link(&format!("/sessions/{}", map.session));
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
         link("lanes-local", GEOJSON, "lanes.geojson?crs=local"),
         link("splines", PROTOBUF, "lanes.pb"),
-        Link { rel: "viewer", media_type: "text/html", href: format!("/viewer?session={}", map.session) },
+        Link { rel: "viewer", media_type: "text/html", href: base.link(&format!("/viewer?session={}", map.session)) },
     ];
     if map.georeference.is_some() {
         links.insert(0, link("lanes", GEOJSON, "lanes.geojson"));
@@ -203,6 +205,7 @@ fn heading_deg(east: f64, north: f64) -> f64 {
 /// `GET /sessions/{id}/lanes.geojson`
 pub(super) async fn lanes_geojson(
     State(state): State<ServeState>,
+    base: LinkBase,
     Path(id): Path<String>,
     uri: Uri,
     headers: HeaderMap,
@@ -210,7 +213,8 @@ pub(super) async fn lanes_geojson(
     let crs = Parameters::read(&uri, &["crs"])?.get("crs", Crs::parse)?.unwrap_or(Crs::Wgs84);
     let map = find(&state.sessions, &id).await?;
     if crs == Crs::Wgs84 && map.georeference.is_none() {
-        return Err(Problem::NotGeoreferenced { session: map.session });
+        let local = base.link(&format!("/sessions/{}/lanes.geojson?crs=local", map.session));
+        return Err(Problem::NotGeoreferenced { session: map.session, local });
     }
     let tag = EntityTag::of((identity(&map), crs));
     if tag.is_held_by(&headers) {
@@ -278,7 +282,8 @@ mod tests {
     fn a_session_that_has_seen_no_frame_has_neither_border_nor_vehicle() {
         let mut map = published(1, 0);
         map.summary.last_sequence = None;
-        let entry = serde_json::to_value(entry(&map, &Extents::default(), &BTreeSet::new())).unwrap();
+        let entry =
+            serde_json::to_value(entry(&map, &Extents::default(), &BTreeSet::new(), &LinkBase::of_path(""))).unwrap();
         assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
         assert_eq!(entry["state"], "live");
     }

@@ -2,11 +2,14 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod transfer;
+
 use std::collections::BTreeSet;
 
 use geojson::{Feature, FeatureCollection, GeoJson, GeometryValue, Position};
 use lanemap_proto::v1::{self, ingest_service_client::IngestServiceClient};
 use lanemap_server::{RunningServer, Server, ServerConfig, session::SessionState};
+use lanemap_tests::servers;
 use prost::Message;
 use reqwest::{Method, Response, StatusCode, header};
 use serde_json::Value;
@@ -34,12 +37,13 @@ struct Service {
 
 impl Service {
     async fn start() -> Self {
+        Self::start_with(|_| {}).await
+    }
+
+    async fn start_with(set: impl FnOnce(&mut ServerConfig)) -> Self {
         let data = tempfile::tempdir().unwrap();
-        let config = ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-            data_dir: data.path().to_owned(),
-            ..ServerConfig::default()
-        };
+        let mut config = servers::config(data.path());
+        set(&mut config);
         let server = Server::start(config).await.unwrap();
         Self { server, client: lanemap_tests::http::client(), _data: data }
     }
@@ -66,7 +70,9 @@ impl Service {
     }
 
     async fn request(&self, method: Method, path: &str, headers: &[(header::HeaderName, &str)]) -> Response {
-        let mut request = self.client.request(method, format!("{}{path}", self.server.url()));
+        // A link of an answer is whole.
+        let url = if path.starts_with("http") { path.to_owned() } else { format!("{}{path}", self.server.url()) };
+        let mut request = self.client.request(method, url);
         for (name, value) in headers {
             request = request.header(name, *value);
         }

@@ -62,6 +62,7 @@ pub mod params;
 mod persistence;
 pub mod placement;
 mod prepared;
+mod receivers;
 mod shown;
 mod sparse;
 pub mod trace;

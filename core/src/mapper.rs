@@ -35,7 +35,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 4;
+const SNAPSHOT_VERSION: u16 = 5;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -214,6 +214,10 @@ impl Mapper {
         let Some(lane) = self.lanes.get_mut(&run.lane) else { return false };
         let params = &self.params.landmark;
         let grown = lane.grow(observation, &self.pose.map_from_vehicle, params);
+        // What the run leaves out lies behind, out of view.
+        if lane.existence.probability() > self.params.landmark.published_existence && lane.knots().0 < run.first {
+            lane.existence.prove();
+        }
         let near = scene::near_knots(lane, run);
         Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, near, &self.sensor, &self.params);
         self.seen_now.push(run.lane);
@@ -257,7 +261,8 @@ impl Mapper {
         lane.last_seen = time;
     }
 
-    /// Lowers the existence of lanes that this frame should have seen, and gives up those that are not there.
+    /// Lowers the existence of lanes that this frame should have seen, and gives up those that are not there: forgets
+    /// them, or, where they were there before, sees no more of them.
     fn judge_existence(&mut self, scene: &Scene) -> Vec<LaneId> {
         if self.params.preset == Preset::Paper {
             return self.end_trials(scene);
@@ -275,10 +280,23 @@ impl Mapper {
                 dropped.push(run.lane);
             }
         }
+        dropped.retain(|id| !self.retire(*id));
         for id in &dropped {
             self.forget(*id);
         }
         dropped
+    }
+
+    /// Keeps a lane that is given up for the stretch that was there; whether there was one.
+    fn retire(&mut self, id: LaneId) -> bool {
+        let least = self.params.landmark.published_existence;
+        let Some(lane) = self.lanes.get_mut(&id).filter(|lane| lane.existence.greatest_probability() > least) else {
+            return false;
+        };
+        lane.retired = true;
+        self.index.remove(id);
+        self.seen_now.retain(|seen| *seen != id);
+        true
     }
 
     /// The authors' rule: a lane that few frames saw by the end of its trial is given up.

@@ -93,7 +93,7 @@ impl Base {
         let fixes = if self.lines.is_empty() { Vec::new() } else { corners.into_iter().map(fix).collect() };
         // Without drives there are no fixes, and no bias is asked for.
         let bias_sigma_m = self.gnss_information.map(|information| information.max(1e-9).powf(-0.5));
-        Restraints { fixes, bias_sigma_m, steps: Vec::new() }
+        Restraints { fixes, bias_sigma_m, stated_sigma_m: 0.0, steps: Vec::new() }
     }
 }
 

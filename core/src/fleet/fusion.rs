@@ -25,6 +25,7 @@ use super::{
     params::FleetParams,
     placement::{Placement, place},
     prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
+    receivers::learned_shape_share,
 };
 use crate::geometry::{
     Pose,
@@ -144,6 +145,9 @@ impl<'a> Fusion<'a> {
         self.place_all();
         for _ in 0..self.params.rounds {
             self.align_all();
+            if self.learn_receivers() {
+                self.align_all();
+            }
             self.draw_lines();
         }
         if self.keep_apart_misfits() | self.keep_apart_strangers() {
@@ -284,6 +288,18 @@ impl<'a> Fusion<'a> {
         let restraints: Vec<&Restraints> = self.restraints.iter().collect();
         let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
         align(&restraints, &mut self.corrections, &sightings, stations, scales);
+    }
+
+    /// Weighs the shape that receivers tell by how far they disagree about it; whether there are drives enough to know.
+    fn learn_receivers(&mut self) -> bool {
+        let drives = self.restraints.iter().zip(&self.corrections).zip(&self.placed);
+        let placed: Vec<_> = drives.filter(|(_, placed)| **placed).map(|(drive, _)| drive).collect();
+        let Some(share) = learned_shape_share(&placed, self.params) else { return false };
+        for (restraints, drive) in self.restraints.iter_mut().zip(self.drives) {
+            restraints.fixes.clone_from(&drive.restraints.fixes);
+            restraints.reweigh_shape(share, self.params);
+        }
+        true
     }
 
     /// Makes the lines again from the corrections as they are.

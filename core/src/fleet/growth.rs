@@ -32,6 +32,20 @@ pub(super) struct Growing<'a> {
 /// Passes after which the lines are no longer settled after each.
 const SETTLED_EACH: usize = 6;
 
+/// A stretch of a lane that lies on no line.
+struct Rest<'a> {
+    /// Number of the lane in the pass.
+    lane: usize,
+    samples: RangeInclusive<usize>,
+    /// The run whose line it extends, and whether it goes on from that run's end (else it leads to its start).
+    extends: Option<(&'a Run, bool)>,
+}
+
+/// Every run, with the number of its lane.
+fn runs_of(matched: &[Vec<Run>]) -> impl Iterator<Item = (usize, &Run)> {
+    matched.iter().enumerate().flat_map(|(lane, runs)| runs.iter().map(move |run| (lane, run)))
+}
+
 /// How many lines each lane of each drive has begun.
 pub(super) type Pieces = BTreeMap<(usize, LaneId), u32>;
 
@@ -42,12 +56,17 @@ impl Growing<'_> {
         let before = lines.lines.len();
         let mut touched = BTreeSet::new();
         let mut changed = false;
-        for (lane, runs) in matched.iter().enumerate() {
-            for run in runs {
-                self.testify(lines, correction, lane, run);
-                touched.insert(run.line);
-            }
-            changed |= self.add_rest(lines, correction, lane, runs, pieces);
+        for (lane, run) in runs_of(&matched) {
+            self.testify(lines, correction, lane, run);
+            touched.insert(run.line);
+        }
+        // Decided for all lanes before any line grows: parameters of runs count from where the lines began.
+        let rests = (0..matched.len()).flat_map(|lane| self.rests(lines, lane, &matched[lane]));
+        for rest in rests.collect::<Vec<Rest<'_>>>() {
+            changed |= match rest.extends {
+                Some((run, onward)) => self.extend(lines, correction, &rest, run, onward),
+                None => self.begin(lines, correction, &rest, pieces),
+            };
         }
         // A mean of many is moved little by one more: it is made anew now and then.
         if self.number < SETTLED_EACH || self.number.is_multiple_of(SETTLED_EACH) {
@@ -87,53 +106,35 @@ impl Growing<'_> {
         (self.drive, self.number, lane)
     }
 
-    /// Adds what of a lane lies on no line; whether there was such.
-    fn add_rest(
-        &self,
-        lines: &mut Lines,
-        correction: &Correction,
-        lane_index: usize,
-        runs: &[Run],
-        pieces: &mut Pieces,
-    ) -> bool {
-        let samples = self.pass.lanes[lane_index].samples.len();
-        let mut added = false;
+    /// What of a lane lies on no line.
+    fn rests<'r>(&self, lines: &Lines, lane: usize, runs: &'r [Run]) -> Vec<Rest<'r>> {
+        let samples = self.pass.lanes[lane].samples.len();
+        let mut rests = Vec::new();
         let mut next = 0;
         let mut before: Option<&Run> = None;
         for run in runs.iter().map(Some).chain([None]) {
             let end = run.map_or(samples, |run| *run.samples.start());
             if end > next {
-                let rest = next..=end - 1;
-                let grows = before.filter(|run| leaves_at_end(lines, run, true)).map(|run| (run, true));
-                let grows =
-                    grows.or_else(|| run.filter(|run| leaves_at_end(lines, run, false)).map(|run| (run, false)));
-                added |= match grows {
-                    Some((run, onward)) => self.extend(lines, correction, lane_index, run, onward, rest),
-                    None => self.begin(lines, correction, lane_index, rest, pieces),
-                };
+                let left = before.filter(|run| leaves_at_end(lines, run, true)).map(|run| (run, true));
+                let extends =
+                    left.or_else(|| run.filter(|run| leaves_at_end(lines, run, false)).map(|run| (run, false)));
+                rests.push(Rest { lane, samples: next..=end - 1, extends });
             }
             if let Some(run) = run {
                 next = *run.samples.end() + 1;
             }
             before = run;
         }
-        added
+        rests
     }
 
-    fn extend(
-        &self,
-        lines: &mut Lines,
-        correction: &Correction,
-        lane_index: usize,
-        run: &Run,
-        onward: bool,
-        rest: RangeInclusive<usize>,
-    ) -> bool {
-        let lane = &self.pass.lanes[lane_index];
+    fn extend(&self, lines: &mut Lines, correction: &Correction, rest: &Rest<'_>, run: &Run, onward: bool) -> bool {
+        let lane = &self.pass.lanes[rest.lane];
         let at_tail = run.is_forward() == onward;
         let line = &mut lines.lines[run.line];
         let before = line.points.len();
-        let order: Vec<usize> = if onward { rest.collect() } else { rest.rev().collect() };
+        let rest_samples = rest.samples.clone();
+        let order: Vec<usize> = if onward { rest_samples.collect() } else { rest_samples.rev().collect() };
         for sample in order {
             let near = &lane.samples[sample];
             let place = correction.apply(&near.map, near.arc_m);
@@ -144,7 +145,7 @@ impl Growing<'_> {
             if offset.norm() < 0.9 * self.params.line_knot_m || offset.dot(&direction) <= 0.0 {
                 continue;
             }
-            let witness = witness_at(self.witness(lane_index), lane, correction, sample, near.parameter);
+            let witness = witness_at(self.witness(rest.lane), lane, correction, sample, near.parameter);
             let knot = Knot { witnesses: vec![witness], ..Knot::default() };
             if at_tail { line.push(place, knot) } else { line.push_front(place, knot) }
         }
@@ -153,24 +154,17 @@ impl Growing<'_> {
         grown > 0
     }
 
-    fn begin(
-        &self,
-        lines: &mut Lines,
-        correction: &Correction,
-        lane_index: usize,
-        rest: RangeInclusive<usize>,
-        pieces: &mut Pieces,
-    ) -> bool {
-        let lane: &PreparedLane<'_> = &self.pass.lanes[lane_index];
+    fn begin(&self, lines: &mut Lines, correction: &Correction, rest: &Rest<'_>, pieces: &mut Pieces) -> bool {
+        let lane: &PreparedLane<'_> = &self.pass.lanes[rest.lane];
         let piece = pieces.entry((self.drive, lane.lane.id)).or_insert(0);
         let Contribution { started, drive, .. } = *self.contribution;
         let mut line = Line::new(FusedLaneId { started, drive, lane: lane.lane.id, piece: *piece, stretch: 0 });
-        for sample in rest {
+        for sample in rest.samples.clone() {
             let near = &lane.samples[sample];
             let place = correction.apply(&near.map, near.arc_m);
             let far = |last| nalgebra::distance(last, &place) >= 0.9 * self.params.line_knot_m;
             if line.points.last().is_none_or(far) {
-                let witness = witness_at(self.witness(lane_index), lane, correction, sample, near.parameter);
+                let witness = witness_at(self.witness(rest.lane), lane, correction, sample, near.parameter);
                 line.push(place, Knot { witnesses: vec![witness], ..Knot::default() });
             }
         }

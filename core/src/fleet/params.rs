@@ -17,7 +17,7 @@ pub struct FleetParams {
     pub odometry_sigma_height_m: f64,
     /// Least standard deviation of what all fixes of a drive have in common, metres.
     pub gnss_bias_sigma_m: f64,
-    /// Standard deviation of what they have not in common, as a share of a fix's own sigma.
+    /// Standard deviation of what they have not in common, as a share of a fix's own sigma, until the drives tell it.
     pub gnss_shape_share: f64,
     /// Fixes closer together than this are one witness of the shape of the way, metres.
     pub gnss_correlation_m: f64,
@@ -69,7 +69,7 @@ impl Default for FleetParams {
             odometry_sigma_rad: 0.0005,
             odometry_sigma_height_m: 0.015,
             gnss_bias_sigma_m: 1.0,
-            gnss_shape_share: 0.3,
+            gnss_shape_share: 0.2,
             gnss_correlation_m: 100.0,
             gnss_robust_scale_m: 2.0,
             lane_correlation_m: 30.0,

@@ -25,6 +25,8 @@ pub(super) struct Restraints {
     pub(super) fixes: Vec<SharedFix>,
     /// Standard deviations of what all fixes have in common, horizontally and in height, metres.
     pub(super) bias_sigma_m: [f64; 2],
+    /// Mean of the standard deviations that the receiver states, horizontally, metres.
+    pub(super) stated_sigma_m: f64,
     /// Odometry's variances between knot `i` and `i + 1` of the correction.
     pub(super) steps: Vec<OdometryStep>,
 }
@@ -132,6 +134,7 @@ impl Restraints {
     fn new(trajectory: &[TrajectoryPoint], anchor: &Anchor, params: &FleetParams) -> Self {
         let mut fixes: Vec<SharedFix> = trajectory.iter().filter_map(|point| shared_fix(point, anchor)).collect();
         let mean = |axis: usize| fixes.iter().map(|fix| fix.sigma_m[axis]).sum::<f64>() / fixes.len().max(1) as f64;
+        let stated_sigma_m = mean(0);
         let bias_sigma_m = [0, 1].map(|axis| mean(axis).max(params.gnss_bias_sigma_m));
         // Fixes near each other share what they are off by: so many witnesses there are of the shape of the way.
         let length_m = fixes.last().map_or(0.0, |last| last.arc_m - fixes[0].arc_m);
@@ -142,7 +145,14 @@ impl Restraints {
         }
         let knots = knot_indices(trajectory, params.correction_knot_m);
         let steps = knots.windows(2).map(|pair| step(&trajectory[pair[0]..=pair[1]], params)).collect();
-        Self { fixes, bias_sigma_m, steps }
+        Self { fixes, bias_sigma_m, stated_sigma_m, steps }
+    }
+
+    /// Weighs what the fixes say of the shape of the way by another share of what the receiver states.
+    pub(super) fn reweigh_shape(&mut self, share: f64, params: &FleetParams) {
+        for fix in &mut self.fixes {
+            fix.sigma_m[0] *= share / params.gnss_shape_share;
+        }
     }
 }
 

@@ -5,6 +5,9 @@
 //! seen: `+ ln(p_d / p_f)`, missed while in view: `+ ln((1 - p_d) / (1 - p_f))`, not in view: nothing. Frames are
 //! correlated (misses and ghosts come in bursts), so each step is taken with `INDEPENDENCE` of its weight.
 
+//! The log-odds are those of the stretch in view. What a line was when a stretch of it left the view is kept beside them
+//! ([`Existence::prove`]): a line that ends, or that traffic hides, after two kilometres was there for two kilometres.
+
 use serde::{Deserialize, Serialize};
 
 /// Chance that a ghost is reported again in the next frame.
@@ -22,14 +25,17 @@ const GIVEN_UP: f64 = 0.05;
 /// Log-odds that a lane exists.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd, Serialize, Deserialize)]
 pub struct Existence {
+    /// Of the stretch in view.
     log_odds: f64,
+    /// Of the stretch that left the view when most was known for it; no evidence yet: 0.
+    proven_log_odds: f64,
 }
 
 impl Existence {
     /// A lane seen for the first time: as likely a ghost as not.
     #[must_use]
     pub fn at_birth() -> Self {
-        Self { log_odds: 0.0 }
+        Self { log_odds: 0.0, proven_log_odds: 0.0 }
     }
 
     /// The detector reported the lane, where it does so with `detection_probability`.
@@ -49,19 +55,35 @@ impl Existence {
     /// Takes the evidence of another lane that turned out to be this one.
     pub fn absorb(&mut self, other: Self) {
         self.log_odds = (self.log_odds.max(0.0) + other.log_odds.max(0.0)).clamp(-CERTAIN, CERTAIN);
+        self.proven_log_odds = self.proven_log_odds.max(other.proven_log_odds);
     }
 
-    /// Whether so much speaks against the lane that the map forgets it.
+    /// A stretch of the lane leaves the view as it is believed now: no later miss speaks against it.
+    pub fn prove(&mut self) {
+        self.proven_log_odds = self.proven_log_odds.max(self.log_odds);
+    }
+
+    /// Probability that the lane exists, or did where it was last in view.
+    #[must_use]
+    pub fn greatest_probability(&self) -> f64 {
+        probability(self.log_odds.max(self.proven_log_odds))
+    }
+
+    /// Whether so much speaks against the lane in view that the map gives it up.
     #[must_use]
     pub fn is_given_up(&self) -> bool {
         self.probability() < GIVEN_UP
     }
 
-    /// Probability that the lane exists.
+    /// Probability that the lane exists where it is in view.
     #[must_use]
     pub fn probability(&self) -> f64 {
-        1.0 / (1.0 + (-self.log_odds).exp())
+        probability(self.log_odds)
     }
+}
+
+fn probability(log_odds: f64) -> f64 {
+    1.0 / (1.0 + (-log_odds).exp())
 }
 
 #[cfg(test)]
@@ -78,6 +100,17 @@ mod tests {
         (0..30).for_each(|_| line.seen(0.85));
         (0..6).for_each(|_| line.missed(0.6));
         assert!(line.probability() > 0.9);
+    }
+
+    #[test]
+    fn misses_at_the_end_of_a_line_do_not_speak_against_what_left_the_view() {
+        let mut lane = Existence::at_birth();
+        (0..30).for_each(|_| lane.seen(0.85));
+        lane.prove();
+        let proven = lane.probability();
+        (0..40).for_each(|_| lane.missed(0.85));
+        assert!(lane.is_given_up());
+        assert_eq!(lane.greatest_probability(), proven);
     }
 
     #[test]

@@ -51,6 +51,8 @@ pub struct Landmark {
     pub first_seen: TimestampNs,
     /// Time of the last frame that saw it.
     pub last_seen: TimestampNs,
+    /// Whether it was given up where it was last in view, and is kept for the stretch that had left it: seen no more.
+    pub retired: bool,
     /// Another lane that may be the same, and how many frames spoke for it (negative: against).
     pub rival: Option<(LaneId, i32)>,
     information: BandedInformation<WIDTH>,
@@ -138,6 +140,7 @@ impl Landmark {
             born_at_frame: 0,
             first_seen: time,
             last_seen: time,
+            retired: false,
             rival: None,
             information: BandedInformation::new(points[0]),
             folded: BandedSum::default(),

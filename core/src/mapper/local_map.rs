@@ -20,16 +20,16 @@ const PIECES_PER_CHORD: usize = 6;
 
 /// Whether a lane is believed enough to be shown to its vehicle.
 fn is_shown(lane: &Landmark, params: &Params) -> bool {
-    is_believed(lane, params.landmark.shown_existence, params)
+    is_confirmed(lane, params) && lane.existence.probability() > params.landmark.shown_existence
 }
 
 /// Whether a lane is believed enough to be published in the drive's map.
 pub(super) fn is_published(lane: &Landmark, params: &Params) -> bool {
-    is_believed(lane, params.landmark.published_existence, params)
+    is_confirmed(lane, params) && lane.existence.greatest_probability() > params.landmark.published_existence
 }
 
-fn is_believed(lane: &Landmark, existence: f64, params: &Params) -> bool {
-    lane.observations >= params.landmark.least_observations && lane.existence.probability() > existence
+fn is_confirmed(lane: &Landmark, params: &Params) -> bool {
+    lane.observations >= params.landmark.least_observations
 }
 
 /// A lane as it is published.
@@ -53,7 +53,7 @@ pub(super) fn map_lane(lane: &Landmark, params: &Params) -> Option<MapLane> {
         ends: params.landmark.ends,
         drawn_from,
         drawn_to,
-        existence: lane.existence.probability(),
+        existence: lane.existence.greatest_probability(),
         observations: lane.observations,
         first_seen: lane.first_seen,
         last_seen: lane.last_seen,

@@ -12,7 +12,11 @@
 //!
 //! Not guaranteed: an `s` for each receiver of its own. All drives of one place share it, in proportion to what they state.
 
-use super::{correction::Correction, params::FleetParams, prepared::Restraints};
+use super::{
+    correction::Correction,
+    params::FleetParams,
+    prepared::{Restraints, count_of},
+};
 
 /// Drives below which nothing is learned.
 const LEAST_DRIVES: usize = 4;
@@ -49,7 +53,7 @@ fn window_shares(restraints: &Restraints, correction: &Correction, params: &Flee
         })
         .collect();
     let common = [0, 1].map(|axis| middle(&mut offsets.iter().map(|(_, offset)| offset[axis]).collect::<Vec<_>>()));
-    let window = |arc_m: f64| (arc_m / params.gnss_correlation_m).floor();
+    let window = |arc_m: f64| count_of(arc_m / params.gnss_correlation_m);
     let windows = offsets.chunk_by(|a, b| window(a.0) == window(b.0));
     let shares = windows.flat_map(|fixes| {
         let mean = |axis: usize| fixes.iter().map(|(_, offset)| offset[axis]).sum::<f64>() / fixes.len() as f64;

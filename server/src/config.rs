@@ -143,6 +143,9 @@ pub struct ServerConfig {
     pub cell_versions_kept_s: u64,
     /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for.
     pub max_cached_cell_bytes: usize,
+    /// Memory for tiles as they are served, and for the lines that they are drawn from, bytes; others are drawn when asked
+    /// for.
+    pub max_cached_tile_bytes: usize,
     /// Memory for cells as they are written for readers (GeoJSON), bytes; those not in it are written anew when asked for.
     pub max_cached_feature_bytes: usize,
     /// Time between pings that find dead connections, seconds, at least 1.
@@ -229,6 +232,7 @@ impl Default for ServerConfig {
             max_contributions_per_cell: 256,
             cell_versions_kept_s: 3600,
             max_cached_cell_bytes: 128 * 1024 * 1024,
+            max_cached_tile_bytes: 256 * 1024 * 1024,
             max_cached_feature_bytes: 128 * 1024 * 1024,
             keep_alive_s: 20,
             start_wait_s: 10,
@@ -343,6 +347,7 @@ impl ServerConfig {
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
         within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;
         within("max_cached_cell_bytes", self.max_cached_cell_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
+        within("max_cached_tile_bytes", self.max_cached_tile_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("max_cached_feature_bytes", self.max_cached_feature_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("request_timeout_s", self.request_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("header_timeout_s", self.header_timeout_s as f64, 1.0, 3600.0, "1 ..= 3600")?;

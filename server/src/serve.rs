@@ -12,6 +12,7 @@
 //! | `/cells/{id}/lanes.geojson` | its lines in WGS84 |
 //! | `/cells/{id}/lanes.pb` | the same as splines, protobuf `lanemap.v1.CellMap` |
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
+//! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
 //! | `/splines/{z}/{x}/{y}` | the lines that touch a tile, as splines, protobuf `lanemap.v1.SplineTile` |
 //! | `/viewer` | a page that draws them |
 //! | `/healthz`, `/readyz`, `/metrics` | for operators |
@@ -38,6 +39,8 @@ pub(crate) mod sample;
 mod sessions;
 mod shared_lanes;
 mod splines;
+mod tile_cache;
+mod tiles;
 mod viewer;
 
 use std::{sync::Arc, time::Duration};
@@ -60,6 +63,7 @@ use self::{
     limits::Limits,
     link_base::{LinkBase, LinkSettings},
     problem::{Problem, repeated},
+    tile_cache::TileCache,
 };
 use crate::{auth::layer::require_read, config::ServerConfig, fuse::SharedMap, session::Sessions};
 
@@ -97,6 +101,7 @@ pub enum Readiness {
 struct Shared {
     state: ServeState,
     extents: Extents,
+    tiles: TileCache,
     links: LinkSettings,
 }
 
@@ -112,6 +117,12 @@ impl FromRef<Shared> for ServeState {
     }
 }
 
+impl FromRef<Shared> for TileCache {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.tiles.clone()
+    }
+}
+
 impl FromRef<Shared> for Extents {
     fn from_ref(shared: &Shared) -> Self {
         shared.extents.drop_removed(&shared.state.sessions);
@@ -124,6 +135,7 @@ impl FromRef<Shared> for Extents {
 /// Maps and metrics are for those who may read them; the viewer's page, which holds none, and health are for all.
 pub fn router(state: ServeState) -> Router {
     let (links, limits) = (LinkSettings::of(&state.config), Arc::new(Limits::of(&state.config)));
+    let tiles = TileCache::new(state.map.clone(), state.config.max_cached_tile_bytes);
     let readers = Router::new()
         .route("/sessions", get(sessions::list))
         .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
@@ -137,6 +149,8 @@ pub fn router(state: ServeState) -> Router {
         .route("/cells/{id}/changes", get(cells::changes_json))
         .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
         .route("/splines/{z}/{x}/{y}", get(splines::tile))
+        .route(tiles::PATH, get(tiles::tile_json))
+        .route("/tiles/lanes/{z}/{x}/{y}", get(tiles::tile))
         .route("/metrics", get(operation::metrics))
         .route_layer(middleware::from_fn(require_read));
     Router::new()
@@ -153,7 +167,7 @@ pub fn router(state: ServeState) -> Router {
         .layer(middleware::from_fn_with_state(limits, limits::keep))
         .layer(middleware::from_fn(limits::head_as_get))
         .layer(cross_origin())
-        .with_state(Shared { state, extents: Extents::default(), links })
+        .with_state(Shared { state, extents: Extents::default(), tiles, links })
 }
 
 /// Pages of any origin may read what its user may.

@@ -224,6 +224,10 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
     max_cached_cell_bytes: Option<usize>,
+    /// Memory for tiles as they are served, and for the lines that they are drawn from, bytes; others are drawn when asked
+    /// for [env: LANEMAP_MAX_CACHED_TILE_BYTES] [default: 268435456]
+    #[arg(long, value_name = "BYTES")]
+    max_cached_tile_bytes: Option<usize>,
     /// Memory for cells as they are written for readers (GeoJSON), bytes; those not in it are written anew when asked for
     /// [env: LANEMAP_MAX_CACHED_FEATURE_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
@@ -322,6 +326,7 @@ impl ServeArgs {
             max_contributions_per_cell: self.max_contributions_per_cell,
             cell_versions_kept_s: self.cell_versions_kept_s,
             max_cached_cell_bytes: self.max_cached_cell_bytes,
+            max_cached_tile_bytes: self.max_cached_tile_bytes,
             max_cached_feature_bytes: self.max_cached_feature_bytes,
             keep_alive_s: self.keep_alive_s,
             start_wait_s: self.start_wait_s,

@@ -117,6 +117,8 @@ pub struct ConfigOverrides {
     pub cell_versions_kept_s: Option<u64>,
     /// See [`ServerConfig::max_cached_cell_bytes`].
     pub max_cached_cell_bytes: Option<usize>,
+    /// See [`ServerConfig::max_cached_tile_bytes`].
+    pub max_cached_tile_bytes: Option<usize>,
     /// See [`ServerConfig::max_cached_feature_bytes`].
     pub max_cached_feature_bytes: Option<usize>,
     /// See [`ServerConfig::keep_alive_s`].
@@ -196,6 +198,7 @@ impl ConfigOverrides {
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
         set(&mut settings.max_cached_cell_bytes, self.max_cached_cell_bytes);
+        set(&mut settings.max_cached_tile_bytes, self.max_cached_tile_bytes);
         set(&mut settings.max_cached_feature_bytes, self.max_cached_feature_bytes);
         set(&mut settings.keep_alive_s, self.keep_alive_s);
         set(&mut settings.start_wait_s, self.start_wait_s);

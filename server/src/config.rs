@@ -141,6 +141,13 @@ pub struct ServerConfig {
     /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;
     /// of one cell at most 128.
     pub cell_versions_kept_s: u64,
+    /// Readers that may follow the map at a time, over HTTP and gRPC together; more are told to come again.
+    pub max_change_readers: usize,
+    /// Time between two signs of life to a reader that follows the map while nothing changes, seconds, at least 1. One that
+    /// takes nothing for four times as long is let go of.
+    pub change_heartbeat_s: u64,
+    /// Most bytes of one change that is sent with its lines; one that is larger is sent without them.
+    pub max_change_event_bytes: usize,
     /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for.
     pub max_cached_cell_bytes: usize,
     /// Memory for tiles as they are served, and for the lines that they are drawn from, bytes; others are drawn when asked
@@ -231,6 +238,9 @@ impl Default for ServerConfig {
             fuse_cpu_share: 0.5,
             max_contributions_per_cell: 256,
             cell_versions_kept_s: 3600,
+            max_change_readers: 1000,
+            change_heartbeat_s: 15,
+            max_change_event_bytes: 256 * 1024,
             max_cached_cell_bytes: 128 * 1024 * 1024,
             max_cached_tile_bytes: 256 * 1024 * 1024,
             max_cached_feature_bytes: 128 * 1024 * 1024,
@@ -346,6 +356,9 @@ impl ServerConfig {
         within("fuse_cpu_share", self.fuse_cpu_share, 0.01, 1.0, "0.01 ..= 1")?;
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
         within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;
+        within("max_change_readers", self.max_change_readers as f64, 0.0, 1e6, "0 ..= 1e6")?;
+        within("change_heartbeat_s", self.change_heartbeat_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
+        within("max_change_event_bytes", self.max_change_event_bytes as f64, 0.0, 2_097_152.0, "0 ..= 2097152")?;
         within("max_cached_cell_bytes", self.max_cached_cell_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("max_cached_tile_bytes", self.max_cached_tile_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
         within("max_cached_feature_bytes", self.max_cached_feature_bytes as f64, 0.0, 1e12, "0 ..= 1e12")?;
@@ -402,6 +415,10 @@ impl ServerConfig {
 
     pub(crate) fn privacy_key_path(&self) -> PathBuf {
         self.data_dir.join(&self.privacy_key_file)
+    }
+
+    pub(crate) fn change_heartbeat(&self) -> Duration {
+        Duration::from_secs(self.change_heartbeat_s)
     }
 
     pub(crate) fn publish_interval(&self) -> Duration {

@@ -14,6 +14,7 @@
 mod bases;
 pub(crate) mod border;
 mod cell_record;
+pub mod follow;
 pub(crate) mod offer;
 pub mod publications;
 mod queue;
@@ -130,7 +131,7 @@ impl Fuser {
         for (session, contributed) in store.contributed()? {
             queue.has_contributed(session, contributed);
         }
-        let publications = Publications::open(store, records.iter().map(|(cell, record)| (*cell, record.version)))?;
+        let publications = Publications::open(store, &records)?;
         map.begin(records, publications, store.clone());
         let shared = Shared {
             settings,

@@ -9,6 +9,7 @@
 
 pub mod admin;
 pub mod auth;
+pub mod change_feed;
 pub mod config;
 pub mod error;
 pub mod fuse;

@@ -1,5 +1,7 @@
 //! Reading maps over gRPC, and the lane map's wire form, which HTTP serves too.
 
+mod watch;
+
 use lanemap_core::{
     Sequence,
     fleet::cell::{CellId, CellIdError},
@@ -12,6 +14,7 @@ use tonic::{Request, Response, Status};
 
 use crate::{
     auth::peer_of,
+    change_feed::ChangeFeeds,
     error::Error,
     fuse::{ChangesError, SharedMap},
     session::{PublishedMap, SessionId, SessionState, SessionSummary, Sessions},
@@ -27,13 +30,14 @@ const MAX_PAGE: usize = 1000;
 pub struct MapGrpc {
     sessions: Sessions,
     map: SharedMap,
+    feeds: ChangeFeeds,
 }
 
 impl MapGrpc {
     /// A service over the published maps.
     #[must_use]
-    pub fn new(sessions: Sessions, map: SharedMap) -> Self {
-        Self { sessions, map }
+    pub fn new(sessions: Sessions, map: SharedMap, feeds: ChangeFeeds) -> Self {
+        Self { sessions, map, feeds }
     }
 }
 
@@ -86,6 +90,17 @@ fn refused(error: ChangesError) -> Status {
 
 #[tonic::async_trait]
 impl MapService for MapGrpc {
+    type WatchChangesStream = watch::Messages;
+
+    async fn watch_changes(
+        &self,
+        request: Request<v1::WatchChangesRequest>,
+    ) -> Result<Response<Self::WatchChangesStream>, Status> {
+        let peer = peer_of(request.extensions())?;
+        peer.may_read(None)?;
+        watch::messages(&self.feeds, peer, &request.into_inner()).map(Response::new)
+    }
+
     async fn list_sessions(
         &self,
         request: Request<v1::ListSessionsRequest>,

@@ -13,6 +13,7 @@
 //! | `/cells/{id}/lanes.pb` | the same as splines, protobuf `lanemap.v1.CellMap` |
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
+//! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
 //! | `/splines/{z}/{x}/{y}` | the lines that touch a tile, as splines, protobuf `lanemap.v1.SplineTile` |
 //! | `/viewer` | a page that draws them |
 //! | `/healthz`, `/readyz`, `/metrics` | for operators |
@@ -21,6 +22,7 @@
 
 pub mod bounds;
 mod cells;
+mod changes;
 mod drive_items;
 mod encoding;
 pub mod entity_tag;
@@ -65,7 +67,9 @@ use self::{
     problem::{Problem, repeated},
     tile_cache::TileCache,
 };
-use crate::{auth::layer::require_read, config::ServerConfig, fuse::SharedMap, session::Sessions};
+use crate::{
+    auth::layer::require_read, change_feed::ChangeFeeds, config::ServerConfig, fuse::SharedMap, session::Sessions,
+};
 
 /// Time for which a browser need not ask again whether it may ask.
 const ONE_DAY: Duration = Duration::from_hours(24);
@@ -77,6 +81,8 @@ pub struct ServeState {
     pub sessions: Sessions,
     /// The shared map.
     pub map: SharedMap,
+    /// Streams of its changes.
+    pub feeds: ChangeFeeds,
     /// Renders `/metrics`.
     pub metrics: PrometheusHandle,
     /// Whether the service takes traffic; falls first when it shuts down.
@@ -148,6 +154,7 @@ pub fn router(state: ServeState) -> Router {
         .route("/cells/{id}/lanes.pb", get(cells::lanes_protobuf))
         .route("/cells/{id}/changes", get(cells::changes_json))
         .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
+        .route("/changes", get(changes::changes))
         .route("/splines/{z}/{x}/{y}", get(splines::tile))
         .route(tiles::PATH, get(tiles::tile_json))
         .route("/tiles/lanes/{z}/{x}/{y}", get(tiles::tile))

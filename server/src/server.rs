@@ -24,6 +24,7 @@ use crate::{
         layer::authenticate,
         reload::{CredentialError, Credentials},
     },
+    change_feed::ChangeFeeds,
     config::{ConfigError, ServerConfig, ZenohMode},
     fuse::{FuseSettings, FuseThreads, Fuser, SharedMap},
     ingest::{BoundedIngest, IngestGrpc, ZenohError, conversation::Conversations, zenoh::ZenohIngest},
@@ -133,6 +134,7 @@ impl Server {
         let http = ServeState {
             sessions: sessions.clone(),
             map: map.clone(),
+            feeds: ChangeFeeds::new(&config, map.clone(), shutdown.clone()),
             metrics,
             ready: is_ready,
             shutdown: shutdown.clone(),
@@ -414,7 +416,7 @@ async fn router(
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()?;
-    let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone(), http.map.clone()))
+    let maps = MapServiceServer::new(MapGrpc::new(http.sessions.clone(), http.map.clone(), http.feeds.clone()))
         .send_compressed(CompressionEncoding::Gzip);
     let ingest = BoundedIngest::new(ingest, config.max_message_bytes);
     let routes = Routes::from(serve::router(http))

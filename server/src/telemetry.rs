@@ -43,6 +43,8 @@ pub const UPDATES_DROPPED: &str = "lanemap_updates_dropped_total";
 pub const CELLS: &str = "lanemap_cells";
 /// Cells of which drives have said something that is not in the map yet.
 pub const CELLS_DIRTY: &str = "lanemap_cells_dirty";
+/// Readers that follow the map.
+pub const CHANGE_READERS: &str = "lanemap_change_readers";
 /// Cells that were fused.
 pub const CELLS_FUSED: &str = "lanemap_cells_fused_total";
 /// Seconds of fusing one cell.
@@ -116,7 +118,7 @@ fn begin_at_zero() {
     for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
         metrics::counter!(REFUSALS, "reason" => reason.as_str_name()).increment(0);
     }
-    for name in [SESSIONS_LIVE, CONNECTIONS, CELLS, CELLS_DIRTY] {
+    for name in [SESSIONS_LIVE, CONNECTIONS, CELLS, CELLS_DIRTY, CHANGE_READERS] {
         metrics::gauge!(name).increment(0.0);
     }
 }
@@ -144,6 +146,7 @@ fn describe() {
     describe_gauge!(BUILD_INFO, Unit::Count, "Always 1, with the version of the service");
     describe_gauge!(CELLS, Unit::Count, "Cells of the shared map");
     describe_gauge!(CELLS_DIRTY, Unit::Count, "Cells that are not fused from what drives say now");
+    describe_gauge!(CHANGE_READERS, Unit::Count, "Readers that follow the map");
     describe_counter!(CELLS_FUSED, Unit::Count, "Cells that were fused");
     describe_histogram!(FUSE_SECONDS, Unit::Seconds, "Fusing one cell");
     describe_counter!(CONTRIBUTIONS, Unit::Count, "Contributions of drives to cells that came or changed");

@@ -8,6 +8,7 @@ pub mod authorities;
 pub mod bags;
 pub mod drives;
 pub mod endpoints;
+pub mod events;
 pub mod fleets;
 pub mod folders;
 pub mod http;

@@ -220,6 +220,19 @@ pub struct ServeArgs {
     /// [env: LANEMAP_CELL_VERSIONS_KEPT_S] [default: 3600]
     #[arg(long, value_name = "S")]
     cell_versions_kept_s: Option<u64>,
+    /// Readers that may follow the map at a time, over HTTP and gRPC together; more are told to come again
+    /// [env: LANEMAP_MAX_CHANGE_READERS] [default: 1000]
+    #[arg(long, value_name = "N")]
+    max_change_readers: Option<usize>,
+    /// Time between two signs of life to a reader that follows the map while nothing changes, seconds, at least 1; one
+    /// that takes nothing for four times as long is let go of
+    /// [env: LANEMAP_CHANGE_HEARTBEAT_S] [default: 15]
+    #[arg(long, value_name = "S")]
+    change_heartbeat_s: Option<u64>,
+    /// Most bytes of one change that is sent with its lines; one that is larger is sent without them
+    /// [env: LANEMAP_MAX_CHANGE_EVENT_BYTES] [default: 262144]
+    #[arg(long, value_name = "BYTES")]
+    max_change_event_bytes: Option<usize>,
     /// Memory for cells of the shared map, bytes; those not in it are read from the store when asked for
     /// [env: LANEMAP_MAX_CACHED_CELL_BYTES] [default: 134217728]
     #[arg(long, value_name = "BYTES")]
@@ -325,6 +338,9 @@ impl ServeArgs {
             fuse_cpu_share: self.fuse_cpu_share,
             max_contributions_per_cell: self.max_contributions_per_cell,
             cell_versions_kept_s: self.cell_versions_kept_s,
+            max_change_readers: self.max_change_readers,
+            change_heartbeat_s: self.change_heartbeat_s,
+            max_change_event_bytes: self.max_change_event_bytes,
             max_cached_cell_bytes: self.max_cached_cell_bytes,
             max_cached_tile_bytes: self.max_cached_tile_bytes,
             max_cached_feature_bytes: self.max_cached_feature_bytes,

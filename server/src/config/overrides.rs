@@ -115,6 +115,12 @@ pub struct ConfigOverrides {
     pub max_contributions_per_cell: Option<usize>,
     /// See [`ServerConfig::cell_versions_kept_s`].
     pub cell_versions_kept_s: Option<u64>,
+    /// See [`ServerConfig::max_change_readers`].
+    pub max_change_readers: Option<usize>,
+    /// See [`ServerConfig::change_heartbeat_s`].
+    pub change_heartbeat_s: Option<u64>,
+    /// See [`ServerConfig::max_change_event_bytes`].
+    pub max_change_event_bytes: Option<usize>,
     /// See [`ServerConfig::max_cached_cell_bytes`].
     pub max_cached_cell_bytes: Option<usize>,
     /// See [`ServerConfig::max_cached_tile_bytes`].
@@ -197,6 +203,9 @@ impl ConfigOverrides {
         set(&mut settings.fuse_cpu_share, self.fuse_cpu_share);
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
+        set(&mut settings.max_change_readers, self.max_change_readers);
+        set(&mut settings.change_heartbeat_s, self.change_heartbeat_s);
+        set(&mut settings.max_change_event_bytes, self.max_change_event_bytes);
         set(&mut settings.max_cached_cell_bytes, self.max_cached_cell_bytes);
         set(&mut settings.max_cached_tile_bytes, self.max_cached_tile_bytes);
         set(&mut settings.max_cached_feature_bytes, self.max_cached_feature_bytes);

@@ -26,7 +26,7 @@ use lanemap_core::fleet::CellId;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::{CellVersion, now_ms};
+use super::{CellRecord, CellVersion, now_ms};
 use crate::journal::{
     JournalError,
     cells::{CellStore, encoded},
@@ -67,6 +67,10 @@ pub struct Publication {
     pub to_version: CellVersion,
     /// When, milliseconds since the Unix epoch.
     pub published_ms: u64,
+    /// Lines of it that are new or differ from those before.
+    pub lines_upserted: u32,
+    /// Lines that are no longer there.
+    pub lines_removed: u32,
 }
 
 /// How a cell changed over several publications.
@@ -80,6 +84,24 @@ pub struct CellChange {
     pub to_version: CellVersion,
     /// The revision of its last publication.
     pub revision: MapRevision,
+    /// Lines that were new or differed, in all publications together.
+    pub lines_upserted: u32,
+    /// Lines that went, in all publications together.
+    pub lines_removed: u32,
+}
+
+impl CellChange {
+    /// No change yet, at the version before a publication.
+    fn before(publication: &Publication) -> Self {
+        Self {
+            cell: publication.cell,
+            from_version: publication.from_version,
+            to_version: publication.from_version,
+            revision: publication.revision,
+            lines_upserted: 0,
+            lines_removed: 0,
+        }
+    }
 }
 
 /// What changed between two revisions.
@@ -130,16 +152,13 @@ impl Publications {
         Self { oldest, kept: kept.into() }
     }
 
-    /// Those of a store whose cells have these versions. One of before there were revisions gets them.
-    pub(super) fn open(
-        store: &CellStore,
-        versions: impl IntoIterator<Item = (CellId, CellVersion)>,
-    ) -> Result<Self, JournalError> {
+    /// Those of a store whose cells these are. One of before there were revisions gets them.
+    pub(super) fn open(store: &CellStore, records: &BTreeMap<CellId, CellRecord>) -> Result<Self, JournalError> {
         let kept: Vec<Publication> = store.publications()?;
         if !kept.is_empty() {
             return Ok(Self::new(kept));
         }
-        let made = of_a_store_without(versions, now_ms());
+        let made = of_a_store_without(records, now_ms());
         let told = made.iter().map(|publication| Ok((publication.revision.0, encoded("a publication", publication)?)));
         store.put_publications(told.collect::<Result<_, JournalError>>()?)?;
         Ok(Self::new(made))
@@ -149,7 +168,7 @@ impl Publications {
         self.kept.back().map_or(self.oldest, |last| last.revision)
     }
 
-    /// The oldest revision of which [`Publications::changed_since`] tells.
+    /// The oldest revision of which [`Publications::changed_between`] tells.
     pub(super) fn oldest(&self) -> MapRevision {
         self.oldest
     }
@@ -170,15 +189,21 @@ impl Publications {
         Ok(self.kept.range(first..))
     }
 
-    pub(super) fn changed_since(&self, since: MapRevision) -> Result<MapChanges, RevisionError> {
+    pub(super) fn changed_between(&self, since: MapRevision, until: MapRevision) -> Result<MapChanges, RevisionError> {
+        if until > self.newest() {
+            return Err(RevisionError::InTheFuture { asked: until, newest: self.newest() });
+        }
         let mut cells: BTreeMap<CellId, CellChange> = BTreeMap::new();
-        for &Publication { revision, cell, from_version, to_version, .. } in self.after(since)? {
-            let change = cells.entry(cell).or_insert(CellChange { cell, from_version, to_version, revision });
-            (change.to_version, change.revision) = (to_version, revision);
+        for publication in self.after(since)?.take_while(|publication| publication.revision <= until) {
+            let change = cells.entry(publication.cell).or_insert_with(|| CellChange::before(publication));
+            change.to_version = publication.to_version;
+            change.revision = publication.revision;
+            change.lines_upserted = change.lines_upserted.saturating_add(publication.lines_upserted);
+            change.lines_removed = change.lines_removed.saturating_add(publication.lines_removed);
         }
         let mut cells: Vec<CellChange> = cells.into_values().collect();
         cells.sort_unstable_by_key(|change| change.revision);
-        Ok(MapChanges { to_revision: self.newest(), cells })
+        Ok(MapChanges { to_revision: until, cells })
     }
 
     /// Makes of the newest versions of all cells those at `revision`; cells that had none then are left out.
@@ -215,17 +240,16 @@ impl Publications {
 }
 
 /// Publications for a store that was written before there were revisions: one for each cell, in their order.
-fn of_a_store_without(
-    versions: impl IntoIterator<Item = (CellId, CellVersion)>,
-    published_ms: u64,
-) -> Vec<Publication> {
-    let published = versions.into_iter().filter(|(_, version)| version.0 > 0);
-    let numbered = published.zip(1..).map(|((cell, to_version), revision)| Publication {
+fn of_a_store_without(records: &BTreeMap<CellId, CellRecord>, published_ms: u64) -> Vec<Publication> {
+    let published = records.iter().filter(|(_, record)| record.version.0 > 0);
+    let numbered = published.zip(1..).map(|((cell, record), revision)| Publication {
         revision: MapRevision(revision),
-        cell,
+        cell: *cell,
         from_version: CellVersion(0),
-        to_version,
+        to_version: record.version,
         published_ms,
+        lines_upserted: record.lanes,
+        lines_removed: 0,
     });
     numbered.collect()
 }
@@ -256,6 +280,8 @@ mod tests {
                 from_version,
                 to_version: *version,
                 published_ms: 10 * at,
+                lines_upserted: 1,
+                lines_removed: 0,
             });
             states.push(state);
         }
@@ -279,7 +305,7 @@ mod tests {
                     continue;
                 }
                 prop_assert_eq!(&versions, state);
-                let changes = publications.changed_since(MapRevision(revision)).unwrap();
+                let changes = publications.changed_between(MapRevision(revision), publications.newest()).unwrap();
                 prop_assert_eq!(changes.to_revision, MapRevision(cells.len() as u64));
                 for change in changes.cells {
                     let before = versions.insert(change.cell, change.to_version).unwrap_or_default();
@@ -296,10 +322,12 @@ mod tests {
         publications.drop_until(MapRevision(2));
         let (oldest, newest) = (MapRevision(2), MapRevision(3));
         let not_kept = RevisionError::NotKept { asked: MapRevision(1), oldest, newest };
-        assert_eq!(publications.changed_since(MapRevision(1)), Err(not_kept));
+        let since = |revision| publications.changed_between(revision, newest);
+        assert_eq!(since(MapRevision(1)), Err(not_kept));
         let in_the_future = RevisionError::InTheFuture { asked: MapRevision(4), newest };
-        assert_eq!(publications.changed_since(MapRevision(4)), Err(in_the_future));
-        assert_eq!(publications.changed_since(newest).unwrap().cells, []);
+        assert_eq!(since(MapRevision(4)), Err(in_the_future));
+        assert_eq!(since(newest).unwrap().cells, []);
+        assert_eq!(publications.changed_between(newest, MapRevision(4)), Err(in_the_future));
     }
 
     #[test]
@@ -323,13 +351,14 @@ mod tests {
         };
         let (journal, _committer) = Journal::open(&options).unwrap();
         let versions = [(cell(1), CellVersion(7)), (cell(2), CellVersion(0)), (cell(3), CellVersion(2))];
-        let publications = Publications::open(&journal.cells(), versions).unwrap();
+        let records = versions.map(|(cell, version)| (cell, CellRecord { version, ..CellRecord::default() }));
+        let publications = Publications::open(&journal.cells(), &records.into()).unwrap();
         assert_eq!((publications.oldest(), publications.newest()), (MapRevision(0), MapRevision(2)));
         let mut at_first = BTreeMap::from(versions);
         publications.go_back(&mut at_first, MapRevision(1)).unwrap();
         assert_eq!(at_first, BTreeMap::from([(cell(1), CellVersion(7))]));
         // They are given once.
-        let again = Publications::open(&journal.cells(), []).unwrap();
+        let again = Publications::open(&journal.cells(), &BTreeMap::new()).unwrap();
         assert_eq!(again.kept, publications.kept);
     }
 }

@@ -20,7 +20,7 @@ use tokio::sync::watch;
 
 use super::{
     CellRecord, CellVersion,
-    publications::{MapChanges, MapRevision, Publication, Publications, RevisionError},
+    publications::{CellChange, MapChanges, MapRevision, Publication, Publications, RevisionError},
     wire::{changes, empty_cell},
 };
 use crate::{
@@ -214,7 +214,36 @@ impl SharedMap {
     /// # Errors
     /// A revision that is not kept any more, or not there yet.
     pub fn changed_since(&self, since: MapRevision) -> Result<MapChanges, RevisionError> {
-        self.at_once(|cells| cells.publications.changed_since(since))
+        self.changed_between(since, None)
+    }
+
+    /// Which cells changed between two revisions, the newer of which may be the newest (`None`).
+    ///
+    /// # Errors
+    /// A revision that is not kept any more, or not there yet.
+    pub fn changed_between(&self, since: MapRevision, until: Option<MapRevision>) -> Result<MapChanges, RevisionError> {
+        self.at_once(|cells| {
+            let until = until.unwrap_or_else(|| cells.publications.newest());
+            cells.publications.changed_between(since, until)
+        })
+    }
+
+    /// Every cell that ever had lines, as a change for who has nothing, whatever publications are kept.
+    #[must_use]
+    pub fn all_cells(&self) -> MapChanges {
+        self.at_once(|cells| {
+            let to_revision = cells.publications.newest();
+            let published = cells.records.iter().filter(|(_, record)| record.version.0 > 0);
+            let changes = published.map(|(cell, record)| CellChange {
+                cell: *cell,
+                from_version: CellVersion(0),
+                to_version: record.version,
+                revision: to_revision,
+                lines_upserted: record.lanes,
+                lines_removed: 0,
+            });
+            MapChanges { to_revision, cells: changes.collect() }
+        })
     }
 
     /// The version of every cell at a revision, cells without lines left out that had never had any. Read them with
@@ -335,6 +364,24 @@ impl SharedMap {
             return Err(ChangesError::NotKept { cell, since, oldest, newest: now });
         };
         Ok(changes(&before, &newest.map))
+    }
+
+    /// What changed in a cell between two versions; all its lines, from version 0, where the older is not kept. `None`
+    /// where the newer is not. Reads the store.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn changes_between(
+        &self,
+        cell: CellId,
+        from: CellVersion,
+        to: CellVersion,
+    ) -> Result<Option<v1::CellChanges>, JournalError> {
+        let Some(after) = self.version_of(cell, to)? else { return Ok(None) };
+        Ok(Some(match self.version_of(cell, from)? {
+            Some(before) => changes(&before.map, &after.map),
+            None => changes(&empty_cell(cell), &after.map),
+        }))
     }
 
     /// The turn to publish; waits while another thread has it.

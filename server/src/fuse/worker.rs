@@ -2,7 +2,7 @@
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{PoisonError, atomic::Ordering},
+    sync::{Arc, PoisonError, atomic::Ordering},
     time::{Duration, Instant},
 };
 
@@ -57,7 +57,7 @@ struct Fused {
 
 /// What of a cell is replaced.
 struct Past {
-    version: CellVersion,
+    map: Arc<v1::CellMap>,
     /// Contributions that are no longer kept.
     dropped: Vec<SessionId>,
     /// A drive in it was deleted.
@@ -225,8 +225,8 @@ impl Worker {
         if let Some(fused) = &fused {
             record.tell(fused, &facts);
         }
-        let published = map.get(cell)?;
-        let is_same = published.is_some_and(|published| published.map.lanes == lanes);
+        let published = map.get(cell)?.map(|published| Arc::clone(&published.map));
+        let is_same = published.as_ref().is_some_and(|published| published.lanes == lanes);
         let next = (!is_same).then(|| {
             record.version = CellVersion(before.version.0 + 1);
             let next = v1::CellMap { version: record.version.0, lanes, ..wire::empty_cell(cell) };
@@ -234,7 +234,8 @@ impl Worker {
             (next, bytes)
         });
         if fused.is_some() || next.is_some() || purged {
-            let past = Past { version: before.version, dropped, purged };
+            let published = published.unwrap_or_else(|| Arc::new(wire::empty_cell(cell)));
+            let past = Past { map: published, dropped, purged };
             self.write(cell, record.clone(), fused.as_ref(), next, past)?;
         }
         self.tell_neighbours(cell, &before.crossings, &record.crossings);
@@ -250,17 +251,20 @@ impl Worker {
         next: Option<(v1::CellMap, Vec<u8>)>,
         past: Past,
     ) -> Result<(), JournalError> {
-        let Past { version: from_version, dropped, purged } = past;
+        let Past { map: before, dropped, purged } = past;
         let outdated = self.outdated(cell, next.is_some(), purged)?;
         let published_ms = now_ms();
         let map = &self.fuser.shared.map;
+        let changes = next.as_ref().map(|(next, _)| wire::changes(&before, next));
         let mut turn = map.turn();
-        let publication = next.is_some().then(|| Publication {
+        let publication = changes.map(|changes| Publication {
             revision: turn.next(),
             cell,
-            from_version,
+            from_version: CellVersion(changes.from_version),
             to_version: record.version,
             published_ms,
+            lines_upserted: u32::try_from(changes.upserted.len()).unwrap_or(u32::MAX),
+            lines_removed: u32::try_from(changes.removed.len()).unwrap_or(u32::MAX),
         });
         let version = next.as_ref().zip(publication).map(|((map, bytes), publication)| {
             Ok::<_, JournalError>(NewVersion {

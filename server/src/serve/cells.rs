@@ -74,10 +74,17 @@ struct Entry {
 
 /// What changed, as GeoJSON.
 #[derive(Serialize)]
-struct Changes {
+pub(super) struct Changes {
     cell: String,
-    from_version: u64,
+    pub(super) from_version: u64,
     to_version: u64,
+    #[serde(flatten)]
+    pub(super) lines: ChangedLines,
+}
+
+/// The lines that changed.
+#[derive(Serialize)]
+pub(super) struct ChangedLines {
     /// Features that are new or differ.
     upserted: Vec<SharedLane>,
     /// Ids of features that are no longer there.
@@ -259,7 +266,8 @@ async fn changes(map: &SharedMap, base: &LinkBase, id: &str, uri: &Uri) -> Resul
     Ok((cell, changes.map_err(refused)?))
 }
 
-fn written(cell: CellId, changes: v1::CellChanges) -> Changes {
+/// Changes as GeoJSON.
+pub(super) fn written(cell: CellId, changes: v1::CellChanges) -> Changes {
     let anchor = cell.anchor();
     let removed = changes.removed.iter().map(|name| feature_id(&name.cell, &name.id, name.part)).collect();
     let after = v1::CellMap {
@@ -271,8 +279,10 @@ fn written(cell: CellId, changes: v1::CellChanges) -> Changes {
     Changes {
         from_version: changes.from_version,
         to_version: changes.to_version,
-        upserted: after.lanes.iter().filter_map(|lane| shared_lane(&anchor, &after, lane)).collect(),
+        lines: ChangedLines {
+            upserted: after.lanes.iter().filter_map(|lane| shared_lane(&anchor, &after, lane)).collect(),
+            removed,
+        },
         cell: after.cell,
-        removed,
     }
 }

@@ -162,6 +162,12 @@ pub enum Problem {
     /// Who sends the request may not do what it asks for.
     #[error("the sender of this request may not {0}")]
     NotPermitted(Action),
+    /// As many are served as may be.
+    #[error("{reason}")]
+    Busy {
+        /// What is full.
+        reason: String,
+    },
     /// The answer could not be made; the fault is ours.
     #[error("the answer could not be made")]
     Internal,
@@ -206,7 +212,7 @@ impl Problem {
             Self::UrlTooLong { .. } => StatusCode::URI_TOO_LONG,
             Self::HeadersTooLarge { .. } => StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE,
             Self::BodyTooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
-            Self::Overdue { .. } => StatusCode::SERVICE_UNAVAILABLE,
+            Self::Overdue { .. } | Self::Busy { .. } => StatusCode::SERVICE_UNAVAILABLE,
             Self::MethodNotAllowed { .. } => StatusCode::METHOD_NOT_ALLOWED,
             Self::NotGeoreferenced { .. } => StatusCode::CONFLICT,
             Self::Unauthenticated(_) => StatusCode::UNAUTHORIZED,
@@ -258,6 +264,7 @@ impl Problem {
             Self::WalkOver { .. } => ("walk-over", "The version of the map is not kept"),
             Self::Unauthenticated(_) => ("unauthenticated", "Unauthenticated"),
             Self::NotPermitted(_) => ("not-permitted", "Not permitted"),
+            Self::Busy { .. } => ("busy", "Too many readers"),
             Self::Internal => ("internal", "Internal error"),
         }
     }
@@ -292,8 +299,13 @@ impl IntoResponse for Problem {
             (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
         ];
         let mut response = (self.status(), headers, body).into_response();
-        if matches!(self, Self::Overdue { .. }) {
-            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("1"));
+        let retry_after_s = match self {
+            Self::Overdue { .. } => Some("1"),
+            Self::Busy { .. } => Some("5"),
+            _ => None,
+        };
+        if let Some(seconds) = retry_after_s {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static(seconds));
         }
         if let Some(challenge) = self.challenge() {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, challenge);

@@ -7,6 +7,7 @@
 //! | `lanemap/v1/{fleet}/{vehicle}/pose` | server | `StreamObservationsResponse`: pose, local map |
 //! | `lanemap/v1/{fleet}/{vehicle}/@alive/{nonce}` | vehicle | liveliness token of one stream |
 //! | `lanemap/v1/@server` | server | liveliness token |
+//! | `lanemap/v1/map/{cell}` | server | `CellMap`: the newest version of the cell; it answers queries, too |
 //!
 //! Ids are percent-encoded in keys ([`encode_id`]), so that none can hold a `/` or a wildcard.
 
@@ -22,10 +23,27 @@ pub const SERVER: &str = "lanemap/v1/@server";
 pub const EVERY_OBSERVATIONS: &str = "lanemap/v1/*/*/observations";
 /// Matches the liveliness token of every stream.
 pub const EVERY_ALIVE: &str = "lanemap/v1/*/*/@alive/*";
+/// Matches every cell of the shared map.
+pub const EVERY_CELL: &str = "lanemap/v1/map/*";
+/// Encoding of cells.
+pub const CELL_ENCODING: &str = "application/protobuf;lanemap.v1.CellMap";
 /// Encoding of requests.
 pub const REQUEST_ENCODING: &str = "application/protobuf;lanemap.v1.StreamObservationsRequest";
 /// Encoding of responses.
 pub const RESPONSE_ENCODING: &str = "application/protobuf;lanemap.v1.StreamObservationsResponse";
+
+/// The key of a cell of the shared map, by its name.
+#[must_use]
+pub fn cell_key(cell: &str) -> String {
+    format!("{PREFIX}/map/{cell}")
+}
+
+/// The name of the cell whose key this is; `None` where it is another key, or one that matches several.
+#[must_use]
+pub fn parse_cell_key(key: &str) -> Option<&str> {
+    let cell = key.strip_prefix(PREFIX)?.strip_prefix("/map/")?;
+    (!cell.is_empty() && !cell.contains(['/', '*', '$'])).then_some(cell)
+}
 
 /// The keys of one vehicle.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]

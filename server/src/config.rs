@@ -80,6 +80,12 @@ pub struct ServerConfig {
     /// Vehicles that may connect to the router with a password: `fleet/vehicle:password` on each line. Each may use its
     /// own keys only. With `zenoh_vehicles_file`, both are asked for.
     pub zenoh_passwords_file: Option<PathBuf>,
+    /// Who may read the shared map from the router, and nothing else: the common name of a certificate, or a user name of
+    /// `zenoh_passwords_file`, on each line.
+    pub zenoh_readers_file: Option<PathBuf>,
+    /// Publish the shared map over zenoh. Where peers are asked who they are, it is published only where access rules are in
+    /// force (or `anonymous_read`).
+    pub zenoh_publish_map: bool,
     /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts.
     pub zenoh_ca_file: Option<PathBuf>,
     /// Name with which a zenoh client connects to its router.
@@ -209,6 +215,8 @@ impl Default for ServerConfig {
             zenoh_connect: Endpoints::default(),
             zenoh_vehicles_file: None,
             zenoh_passwords_file: None,
+            zenoh_readers_file: None,
+            zenoh_publish_map: true,
             zenoh_ca_file: None,
             zenoh_user: None,
             zenoh_password_file: None,

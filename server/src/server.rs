@@ -159,8 +159,15 @@ impl Server {
         let zenoh = match config.zenoh_mode {
             ZenohMode::Off => None,
             ZenohMode::Router | ZenohMode::Client => Some(
-                ZenohIngest::open(&config, conversations, Arc::clone(&credentials.authenticator), streams.clone())
-                    .await?,
+                ZenohIngest::open(
+                    &config,
+                    conversations,
+                    Arc::clone(&credentials.authenticator),
+                    streams.clone(),
+                    &map,
+                    shutdown.clone(),
+                )
+                .await?,
             ),
         };
 

@@ -60,6 +60,8 @@ pub const ZENOH_BROKEN: &str = "lanemap_zenoh_streams_broken_total";
 pub const ZENOH_REPEATED: &str = "lanemap_zenoh_messages_repeated_total";
 /// Messages over zenoh that belong to no stream.
 pub const ZENOH_TURNED_AWAY: &str = "lanemap_zenoh_messages_turned_away_total";
+/// Queries of the map over zenoh for which there was no room.
+pub const ZENOH_QUERIES_TURNED_AWAY: &str = "lanemap_zenoh_queries_turned_away_total";
 /// HTTP requests and gRPC calls, by `method`, `route` and `status`.
 pub const REQUESTS: &str = "lanemap_http_requests_total";
 /// Seconds from a request to the head of its answer, by `method` and `route`.
@@ -112,7 +114,7 @@ fn begin_at_zero() {
     for name in [FRAMES_ACKED, FRAMES_REPEATED, UPDATES_DROPPED, HANDSHAKES_FAILED, CREDENTIALS_REFUSED] {
         metrics::counter!(name).increment(0);
     }
-    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY, CELLS_FUSED, CONTRIBUTIONS] {
+    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY, ZENOH_QUERIES_TURNED_AWAY, CELLS_FUSED, CONTRIBUTIONS] {
         metrics::counter!(name).increment(0);
     }
     for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
@@ -140,6 +142,7 @@ fn describe() {
     describe_counter!(ZENOH_BROKEN, Unit::Count, "Streams over zenoh that a missing or refused message ended, by code");
     describe_counter!(ZENOH_REPEATED, Unit::Count, "Messages over zenoh that came again");
     describe_counter!(ZENOH_TURNED_AWAY, Unit::Count, "Messages over zenoh that belong to no stream");
+    describe_counter!(ZENOH_QUERIES_TURNED_AWAY, Unit::Count, "Queries of the map for which there was no room");
     describe_counter!(REQUESTS, Unit::Count, "HTTP requests and gRPC calls, by method, route and status");
     describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "From a request to the head of its answer");
     describe_gauge!(READY, Unit::Count, "1 while the service takes traffic, 0 from the moment it begins to stop");

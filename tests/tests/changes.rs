@@ -6,15 +6,20 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use lanemap_core::fleet::CellId;
-use lanemap_proto::v1::{self, map_service_client::MapServiceClient, watch_changes_response::Told};
+use lanemap_proto::{
+    v1::{self, map_service_client::MapServiceClient, watch_changes_response::Told},
+    zenoh_keys::{CELL_ENCODING, EVERY_CELL, cell_key},
+};
 use lanemap_server::{
     Server, ServerConfig,
+    config::ZenohMode,
     fuse::{CellVersion, MapRevision, RevisionError, SharedMap, wire::apply},
 };
 use lanemap_tests::{
+    endpoints::HeldEndpoint,
     events::{Event, Events},
     fleets::{PATIENCE, WireDrive, along_a_road, cell_bytes, cells_until, settled},
-    http,
+    http, raw_zenoh,
     servers::{self, ServerProcess},
 };
 use prost::Message;
@@ -426,4 +431,53 @@ async fn a_caller_that_reads_slowly_is_told_of_what_it_missed_at_once_and_holds_
     server.shutdown().await;
     let end = timeout(PATIENCE, async { while let Ok(Some(_)) = slow.message().await {} }).await;
     assert!(end.is_ok(), "the stream has an end");
+}
+
+/// The cells that a query is answered with: their keys and bytes.
+async fn queried(session: &zenoh::Session, key: &str) -> BTreeMap<String, Vec<u8>> {
+    let replies = session.get(key).await.unwrap();
+    let mut cells = BTreeMap::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let sample = reply.into_result().unwrap();
+        assert_eq!(sample.encoding().to_string(), CELL_ENCODING);
+        cells.insert(sample.key_expr().to_string(), sample.payload().to_bytes().to_vec());
+    }
+    cells
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn over_zenoh_every_cell_is_put_as_it_changes_and_queried_as_it_is() {
+    let drives = along_a_road(30, 2, 200.0, true);
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = HeldEndpoint::tcp();
+    let server = lively(folder.path(), |config| {
+        config.zenoh_mode = ZenohMode::Router;
+        config.zenoh_listen = endpoint.parse().unwrap();
+    })
+    .await;
+    let session = raw_zenoh::connect(&endpoint).await;
+    assert!(queried(&session, EVERY_CELL).await.is_empty());
+    let heard = session.declare_subscriber(EVERY_CELL).await.unwrap();
+    drives[0].upload_whole(&server.url()).await;
+    // A subscriber that is declared just now may miss the first puts: it asks, and hears the rest.
+    settled(&server).await;
+    let mut copy = queried(&session, EVERY_CELL).await;
+    assert_eq!(copy.len(), 2);
+    drives[1].upload_whole(&server.url()).await;
+    settled(&server).await;
+    let fresh: BTreeMap<String, Vec<u8>> =
+        cell_bytes(&server.url()).await.into_iter().map(|(cell, bytes)| (cell_key(&cell), bytes)).collect();
+    let following = async {
+        while copy != fresh {
+            let sample = heard.recv_async().await.unwrap();
+            assert_eq!(sample.encoding().to_string(), CELL_ENCODING);
+            copy.insert(sample.key_expr().to_string(), sample.payload().to_bytes().to_vec());
+        }
+    };
+    timeout(PATIENCE, following).await.expect("what is put is the map");
+    assert_eq!(queried(&session, EVERY_CELL).await, fresh);
+    let (key, bytes) = fresh.first_key_value().unwrap();
+    assert_eq!(queried(&session, key).await, BTreeMap::from([(key.clone(), bytes.clone())]));
+    assert!(queried(&session, "lanemap/v1/map/14-1-1").await.is_empty());
+    server.shutdown().await;
 }

@@ -113,6 +113,14 @@ pub struct ServeArgs {
     /// own keys only. With --zenoh-vehicles-file, both are asked for [env: LANEMAP_ZENOH_PASSWORDS_FILE] [default: none]
     #[arg(long, value_name = "FILE")]
     zenoh_passwords_file: Option<PathBuf>,
+    /// Who may read the shared map from the router, and nothing else: the common name of a certificate, or a user name of
+    /// --zenoh-passwords-file, on each line [env: LANEMAP_ZENOH_READERS_FILE] [default: none]
+    #[arg(long, value_name = "FILE")]
+    zenoh_readers_file: Option<PathBuf>,
+    /// Publish the shared map over zenoh. Where peers are asked who they are, it is published only where access rules are
+    /// in force (or --anonymous-read) [env: LANEMAP_ZENOH_PUBLISH_MAP] [default: true]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    zenoh_publish_map: Option<bool>,
     /// Authorities of the certificates of routers to connect to, PEM; without it, those that the system trusts
     /// [env: LANEMAP_ZENOH_CA_FILE] [default: none]
     #[arg(long, value_name = "FILE")]
@@ -309,6 +317,8 @@ impl ServeArgs {
             zenoh_connect: self.zenoh_connect.clone(),
             zenoh_vehicles_file: self.zenoh_vehicles_file.clone(),
             zenoh_passwords_file: self.zenoh_passwords_file.clone(),
+            zenoh_readers_file: self.zenoh_readers_file.clone(),
+            zenoh_publish_map: self.zenoh_publish_map,
             zenoh_ca_file: self.zenoh_ca_file.clone(),
             zenoh_user: self.zenoh_user.clone(),
             zenoh_password_file: self.zenoh_password_file.clone(),

@@ -24,6 +24,9 @@ impl ServerConfig {
         needs("zenoh_vehicles_file", listed, router, "zenoh_mode: router")?;
         needs("zenoh_vehicles_file", listed, self.tls_client_ca_file.is_some(), "tls_client_ca_file")?;
         needs("zenoh_passwords_file", self.zenoh_passwords_file.is_some(), router, "zenoh_mode: router")?;
+        let proofs = listed || self.zenoh_passwords_file.is_some();
+        let readers = self.zenoh_readers_file.is_some();
+        needs("zenoh_readers_file", readers, proofs, "zenoh_vehicles_file or zenoh_passwords_file")?;
         needs("zenoh_ca_file", self.zenoh_ca_file.is_some(), client, "zenoh_mode: client")?;
         needs("zenoh_user", self.zenoh_user.is_some(), client, "zenoh_mode: client")?;
         needs("zenoh_user", self.zenoh_user.is_some(), self.zenoh_password_file.is_some(), "zenoh_password_file")?;
@@ -42,6 +45,12 @@ impl ServerConfig {
     /// Whether peers of gRPC and HTTP are asked who they are.
     pub(crate) fn asks_who_peers_are(&self) -> bool {
         self.tls_client_ca_file.is_some() || self.token_keys_file.is_some()
+    }
+
+    /// Whether the shared map is published over zenoh: where whoever reads it there may.
+    pub(crate) fn publishes_map_over_zenoh(&self) -> bool {
+        let is_open = !self.asks_who_peers_are() || self.anonymous_read;
+        self.zenoh_publish_map && (self.zenoh_key_is_proof() || is_open)
     }
 
     /// Whether nobody but a vehicle can publish on its keys in zenoh.

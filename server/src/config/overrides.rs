@@ -57,6 +57,10 @@ pub struct ConfigOverrides {
     pub zenoh_vehicles_file: Option<PathBuf>,
     /// See [`ServerConfig::zenoh_passwords_file`].
     pub zenoh_passwords_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_readers_file`].
+    pub zenoh_readers_file: Option<PathBuf>,
+    /// See [`ServerConfig::zenoh_publish_map`].
+    pub zenoh_publish_map: Option<bool>,
     /// See [`ServerConfig::zenoh_ca_file`].
     pub zenoh_ca_file: Option<PathBuf>,
     /// See [`ServerConfig::zenoh_user`].
@@ -174,6 +178,8 @@ impl ConfigOverrides {
         set(&mut settings.zenoh_connect, self.zenoh_connect);
         set_optional(&mut settings.zenoh_vehicles_file, self.zenoh_vehicles_file);
         set_optional(&mut settings.zenoh_passwords_file, self.zenoh_passwords_file);
+        set_optional(&mut settings.zenoh_readers_file, self.zenoh_readers_file);
+        set(&mut settings.zenoh_publish_map, self.zenoh_publish_map);
         set_optional(&mut settings.zenoh_ca_file, self.zenoh_ca_file);
         set_optional(&mut settings.zenoh_user, self.zenoh_user);
         set_optional(&mut settings.zenoh_password_file, self.zenoh_password_file);

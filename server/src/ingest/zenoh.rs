@@ -25,6 +25,9 @@
 //! 6. When the vehicle's token goes, its stream is closed as a broken gRPC stream is. While the server takes
 //!    observations it holds the token `lanemap/v1/@server`.
 //!
+//! # The map
+//! Beside the conversation the server publishes the shared map, and answers queries of it: see [`map`].
+//!
 //! Who may use which keys, and how a token travels, stands in [`access`].
 //!
 //! Callbacks of zenoh never wait: they put into bounded queues. What publishes may wait for a slow vehicle, and does so
@@ -34,7 +37,7 @@ use std::{sync::Arc, time::Duration};
 
 use lanemap_proto::zenoh_keys;
 use tokio::time::timeout;
-use tokio_util::task::TaskTracker;
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tracing::{instrument::WithSubscriber, subscriber::NoSubscriber};
 use zenoh::{
     Session,
@@ -49,16 +52,19 @@ use super::conversation::Conversations;
 use crate::{
     auth::{Authenticator, reload::CredentialError},
     config::{ServerConfig, ZenohMode},
+    fuse::SharedMap,
 };
 
 pub mod access;
 mod answers;
 mod inbound;
 mod link_security;
+mod map;
 mod streams;
 mod transport_config;
 mod turned_away;
 
+use map::MapInZenoh;
 use streams::Streams;
 
 /// How long a lost message is waited for. What follows it waits meanwhile, so it is short.
@@ -103,6 +109,7 @@ pub(crate) struct ZenohIngest {
     _observations: AdvancedSubscriber<()>,
     _alive: Subscriber<()>,
     _server: LivelinessToken,
+    _map: Option<MapInZenoh>,
 }
 
 impl ZenohIngest {
@@ -112,12 +119,19 @@ impl ZenohIngest {
         conversations: Conversations,
         authenticator: Arc<Authenticator>,
         tracked: TaskTracker,
+        map: &SharedMap,
+        shutdown: CancellationToken,
     ) -> Result<Self, ZenohError> {
         let transport = transport_config::transport_config(config)?;
         // Zenoh logs its configuration while it opens, the password with which it connects included. It opens before
         // the first poll of what `open` gives: hence a future around it.
         let opening = async { zenoh::open(transport).await }.with_subscriber(NoSubscriber::default());
         let session = opening.await.map_err(|error| ZenohError::Open(error.to_string()))?;
+        let map = if config.publishes_map_over_zenoh() {
+            Some(MapInZenoh::declare(&session, map, &tracked, shutdown)?)
+        } else {
+            None
+        };
         let streams = Arc::new(Streams::new(config, conversations, authenticator, session.clone(), tracked));
         let observations = subscribe_to_observations(&session, Arc::clone(&streams))?;
         let alive = subscribe_to_tokens(&session, streams)?;
@@ -128,7 +142,7 @@ impl ZenohIngest {
             ZenohMode::Router => tracing::info!(%mode, %listen, "taking observations over zenoh"),
             ZenohMode::Client | ZenohMode::Off => tracing::info!(%mode, %connect, "taking observations over zenoh"),
         }
-        Ok(Self { session, _observations: observations, _alive: alive, _server: server })
+        Ok(Self { session, _observations: observations, _alive: alive, _server: server, _map: map })
     }
 
     /// Leaves zenoh; vehicles see the server's token go. Streams must have ended before.

@@ -6,13 +6,14 @@ use super::PATIENCE;
 use lanemap_proto::{
     encode as wire,
     v1::{self, stream_observations_request::Message, stream_observations_response::Message as Answer},
-    zenoh_keys::{Attachment, REQUEST_ENCODING, SERVER, attachment_with_token},
+    zenoh_keys::{Attachment, EVERY_CELL, REQUEST_ENCODING, SERVER, attachment_with_token},
 };
 use lanemap_server::{RunningServer, Server, ServerConfig, config::ZenohMode};
 use lanemap_tests::{
     authorities::{Authority, Certified, TlsFolder},
     drives,
     endpoints::HeldEndpoint,
+    fleets::{along_a_road, settled},
     raw_zenoh::{RawZenohStream, configuration},
     servers,
     tokens::{self, TokenIssuer},
@@ -20,6 +21,7 @@ use lanemap_tests::{
 use prost::Message as _;
 use serde_json::{Value, json};
 use tempfile::TempDir;
+use tokio::time::timeout;
 use zenoh::{Config, Session, handlers::FifoChannelHandler, pubsub::Subscriber, query::ReplyKeyExpr, sample::Sample};
 
 /// Time after which an answer that is not allowed is given up.
@@ -93,6 +95,50 @@ impl Router {
         let certified = self.tls.vehicles.vehicle_by_common_name("north", vehicle, serial);
         self.connect_with(&certified).await.unwrap()
     }
+}
+
+/// Number of cells that a query of the map is answered with.
+async fn cells_queried(session: &Session) -> usize {
+    let replies = session.get(EVERY_CELL).timeout(NO_ANSWER).await.unwrap();
+    let mut cells = 0;
+    while let Ok(reply) = replies.recv_async().await {
+        cells += usize::from(reply.into_result().is_ok());
+    }
+    cells
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_reader_may_read_the_shared_map_and_publish_nothing_in_it_and_a_vehicle_not_even_that() {
+    let router = Router::start(HeldEndpoint::tcp(), |tls, config| {
+        let passwords = tls.write("passwords", "north/car-1:first\nplanner:second\n");
+        let readers = tls.write("readers", "planner\n");
+        let config = ServerConfig { zenoh_passwords_file: Some(passwords), tls_client_ca_file: None, ..config };
+        ServerConfig { zenoh_readers_file: Some(readers), tls_cert_file: None, tls_key_file: None, ..config }
+    })
+    .await;
+    let reader = router.connect_as("planner", "second").await.unwrap();
+    let vehicle = router.connect_as("north/car-1", "first").await.unwrap();
+    let of_reader = reader.declare_subscriber(EVERY_CELL).await.unwrap();
+    let of_vehicle = vehicle.declare_subscriber(EVERY_CELL).await.unwrap();
+    // Nobody but the server gets a word to another.
+    let forger = router.connect_as("planner", "second").await.unwrap();
+    for session in [&forger, &vehicle] {
+        session.put("lanemap/v1/map/14-1-1", "forged").await.unwrap();
+    }
+
+    let drives = along_a_road(31, 1, 120.0, false);
+    drives[0].upload_whole(&router.server.url()).await;
+    settled(&router.server).await;
+    let heard = timeout(PATIENCE, of_reader.recv_async()).await.unwrap().unwrap();
+    assert!(heard.key_expr().as_str().starts_with("lanemap/v1/map/14-"), "{heard:?}");
+    assert_ne!(heard.key_expr().as_str(), "lanemap/v1/map/14-1-1");
+    assert_eq!(cells_queried(&reader).await, 1);
+    assert_eq!(cells_queried(&vehicle).await, 0);
+    // Its own words come back to it within its session.
+    let overheard = std::iter::from_fn(|| of_vehicle.try_recv().ok().flatten());
+    let overheard: Vec<_> = overheard.filter(|sample| sample.payload().to_bytes().as_ref() != b"forged").collect();
+    assert!(overheard.is_empty(), "a vehicle hears nothing of the map");
+    router.server.shutdown().await;
 }
 
 fn start(vehicle: &str) -> v1::SessionStart {

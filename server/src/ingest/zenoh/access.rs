@@ -6,13 +6,15 @@
 //! of a message proves whose it is, wherever these rules are in force: in the server where it is the router, in another
 //! router that was given them ([`AccessRules::for_router`]).
 //!
+//! Readers, by names of their own (`zenoh_readers_file`), may hear and query the shared map, and say nothing.
+//!
 //! A bearer token may travel besides, in the attachment of message 0 of a stream. It is asked for where the key proves
 //! nothing, and binds the stream to its roles and its expiry where it is there. It does not replace these rules: without
 //! them whoever reaches the router could read it, or put messages into the stream that it opened.
 
 use std::{collections::BTreeSet, path::Path};
 
-use lanemap_proto::zenoh_keys::{EVERY_ALIVE, EVERY_OBSERVATIONS, PREFIX, SERVER};
+use lanemap_proto::zenoh_keys::{EVERY_ALIVE, EVERY_CELL, EVERY_OBSERVATIONS, PREFIX, SERVER};
 use serde_json::{Value, json};
 
 use crate::{
@@ -39,6 +41,8 @@ pub struct AccessRules {
     vehicles: BTreeSet<VehicleName>,
     /// Names of links that may use every key below `lanemap/v1`: servers that are clients of the router.
     servers: Vec<String>,
+    /// Names of links that may read the shared map.
+    readers: BTreeSet<String>,
 }
 
 impl AccessRules {
@@ -51,28 +55,33 @@ impl AccessRules {
         if listed.is_none() && passwords.is_none() {
             return Ok(None);
         }
-        Self::for_router(listed.as_deref(), passwords.as_deref(), Vec::new()).map(Some)
+        Self::for_router(listed.as_deref(), passwords.as_deref(), settings.zenoh_readers_file.as_deref(), Vec::new())
+            .map(Some)
     }
 
     /// The rules of a router for the vehicles that have a certificate (`listed`), a password, or, where both are given,
-    /// both; and for `servers`, by the names with which they connect.
+    /// both; for `readers` of the shared map, one name on a line; and for `servers`, by the names with which they connect.
     ///
     /// # Errors
     /// A file that cannot be read, or a line that names no vehicle.
     pub fn for_router(
         listed: Option<&Path>,
         passwords: Option<&Path>,
+        readers: Option<&Path>,
         servers: Vec<String>,
     ) -> Result<Self, CredentialError> {
         let proofs = Proofs { certificate: listed.is_some(), password: passwords.is_some() };
-        let listed = listed.map(|path| names("zenoh_vehicles_file", path, |line| line, &servers)).transpose()?;
+        let readers = readers.map(|path| lines("zenoh_readers_file", path)).transpose()?.unwrap_or_default();
+        let readers: BTreeSet<String> = readers.into_iter().map(|(_, name)| name).collect();
+        let others: Vec<String> = servers.iter().chain(&readers).cloned().collect();
+        let listed = listed.map(|path| names("zenoh_vehicles_file", path, |line| line, &others)).transpose()?;
         let with_password =
-            passwords.map(|path| names("zenoh_passwords_file", path, before_colon, &servers)).transpose()?;
+            passwords.map(|path| names("zenoh_passwords_file", path, before_colon, &others)).transpose()?;
         let vehicles = match (listed, with_password) {
             (Some(listed), Some(with_password)) => listed.intersection(&with_password).cloned().collect(),
             (listed, with_password) => listed.or(with_password).unwrap_or_default(),
         };
-        Ok(Self { proofs, vehicles, servers })
+        Ok(Self { proofs, vehicles, servers, readers })
     }
 
     /// How links show who they are.
@@ -96,6 +105,16 @@ impl AccessRules {
             rules.push(rule(&hears, "egress", &SAYS, &keys.hears));
             subjects.push(self.subject(&number.to_string(), &vehicle.encoded()));
             policies.push(json!({ "rules": ["asked", speaks, listens, hears], "subjects": [number.to_string()] }));
+        }
+        let map = [EVERY_CELL.to_owned(), SERVER.to_owned()];
+        if !self.readers.is_empty() {
+            rules.push(rule("reads", "ingress", &ASKS, &map));
+            rules.push(rule("told", "egress", &SAYS, &map));
+        }
+        for (number, reader) in self.readers.iter().enumerate() {
+            let id = format!("reader {number}");
+            subjects.push(self.subject(&id, reader));
+            policies.push(json!({ "rules": ["reads", "told"], "subjects": [id] }));
         }
         for (number, server) in self.servers.iter().enumerate() {
             let id = format!("server {number}");
@@ -168,25 +187,31 @@ fn before_colon(line: &str) -> &str {
     line.split_once(':').map_or(line, |(name, _)| name.trim())
 }
 
-/// The vehicles that a file names, one on a line; empty lines, lines that begin with `#` and `servers` are passed over.
-fn names(
-    setting: &'static str,
-    path: &Path,
-    name: impl Fn(&str) -> &str,
-    servers: &[String],
-) -> Result<BTreeSet<VehicleName>, CredentialError> {
+/// The lines of a file and their numbers, from 0; empty lines and lines that begin with `#` are passed over.
+fn lines(setting: &'static str, path: &Path) -> Result<Vec<(usize, String)>, CredentialError> {
     let bytes = read(setting, path)?;
     let text = str::from_utf8(&bytes).map_err(|error| CredentialError::new(setting, path, error))?;
     let lines = text.lines().map(str::trim).enumerate();
     let lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
-    let named = lines.map(|(index, line)| (index, name(line)));
+    Ok(lines.map(|(index, line)| (index, line.to_owned())).collect())
+}
+
+/// The vehicles that a file names, one on a line; `others`, which are none, are passed over.
+fn names(
+    setting: &'static str,
+    path: &Path,
+    name: impl Fn(&str) -> &str,
+    others: &[String],
+) -> Result<BTreeSet<VehicleName>, CredentialError> {
+    let lines = lines(setting, path)?;
+    let named = lines.iter().map(|(index, line)| (*index, name(line)));
     let vehicle = |(index, name): (usize, &str)| {
         name.parse::<VehicleName>().map_err(|error| {
             // The line itself may hold a password.
             CredentialError::new(setting, path, format!("line {}: {error}", index + 1))
         })
     };
-    named.filter(|(_, name)| !servers.iter().any(|server| server == name)).map(vehicle).collect()
+    named.filter(|(_, name)| !others.iter().any(|other| other == name)).map(vehicle).collect()
 }
 
 #[cfg(test)]
@@ -221,7 +246,9 @@ mod tests {
 
     fn rules() -> Value {
         let listed = file("# cars\nnorth/car-1\n\n north/car%2F2 \n");
-        AccessRules::for_router(Some(listed.path()), None, vec!["server".to_owned()]).unwrap().to_json()
+        let readers = file("# planners\nplanner\n");
+        let servers = vec!["server".to_owned()];
+        AccessRules::for_router(Some(listed.path()), None, Some(readers.path()), servers).unwrap().to_json()
     }
 
     #[test]
@@ -280,10 +307,42 @@ mod tests {
     }
 
     #[test]
+    fn a_reader_may_hear_and_query_the_map_and_say_nothing() {
+        let rules = rules();
+        let cell = "lanemap/v1/map/14-8718-5685";
+        for (flow, message, key) in [
+            ("ingress", "declare_subscriber", EVERY_CELL),
+            ("ingress", "query", cell),
+            ("ingress", "liveliness_query", SERVER),
+            ("egress", "put", cell),
+            ("egress", "reply", cell),
+        ] {
+            assert!(allows(&rules, "reader 0", flow, message, key), "{flow} {message} {key}");
+        }
+        for (subject, flow, message, key) in [
+            ("reader 0", "ingress", "put", cell),
+            ("reader 0", "ingress", "delete", cell),
+            ("reader 0", "ingress", "declare_queryable", EVERY_CELL),
+            ("reader 0", "ingress", "reply", cell),
+            ("reader 0", "ingress", "declare_subscriber", "lanemap/v1/**"),
+            ("reader 0", "ingress", "declare_subscriber", EVERY_OBSERVATIONS),
+            ("reader 0", "ingress", "put", "lanemap/v1/north/car-1/observations"),
+            ("reader 0", "egress", "put", "lanemap/v1/north/car-1/acks"),
+            ("0", "ingress", "query", cell),
+            ("0", "ingress", "put", cell),
+            ("0", "egress", "put", cell),
+        ] {
+            assert!(!allows(&rules, subject, flow, message, key), "{subject} {flow} {message} {key}");
+        }
+        assert!(allows(&rules, "server 0", "ingress", "put", cell));
+    }
+
+    #[test]
     fn both_proofs_are_asked_for_where_both_are_given() {
         let (listed, passwords) =
             (file("north/car-1\nnorth/car-2\n"), file("north/car-2: second\nnorth/car-3:third\n"));
-        let rules = AccessRules::for_router(Some(listed.path()), Some(passwords.path()), Vec::new()).unwrap().to_json();
+        let rules = AccessRules::for_router(Some(listed.path()), Some(passwords.path()), None, Vec::new());
+        let rules = rules.unwrap().to_json();
         let subject = json!({ "id": "0", "cert_common_names": ["north/car-2"], "usernames": ["north/car-2"] });
         assert_eq!(rules["subjects"], json!([subject]));
         assert!(!rules.to_string().contains("second"));
@@ -292,7 +351,7 @@ mod tests {
     #[test]
     fn a_line_that_names_no_vehicle_is_refused_by_its_number_and_not_repeated() {
         let passwords = file("north/car-1:first\ncar-2:hidden\n");
-        let error = AccessRules::for_router(None, Some(passwords.path()), Vec::new()).unwrap_err().to_string();
+        let error = AccessRules::for_router(None, Some(passwords.path()), None, Vec::new()).unwrap_err().to_string();
         assert!(error.contains("line 2") && error.contains("fleet/vehicle") && !error.contains("hidden"), "{error}");
     }
 }

@@ -1,25 +1,37 @@
-"""Python client of lanemap: stream what a vehicle's camera sees, hear where the vehicle is.
+"""Python client of lanemap: stream what a vehicle's camera sees, hear where the vehicle is; read the map of all vehicles.
 
     import lanemap
 
     camera = lanemap.Sensor(lanemap.Pose(1.5, 0, 1.6), axes="vehicle")
     with lanemap.Session("http://localhost:8080", fleet="f", vehicle="v", drive="d", sensor=camera, spool="spool") as s:
-        s.send(time_ns, pose, [lane_points])  # (n, 3) arrays, metres
+        s.send(time_ns, pose, [lane_points    "Watch",
+])  # (n, 3) arrays, metres
 
 A session outlives its connection, and with a spool its process: what is not acked is sent again.
+
+    for curve in lanemap.Map("http://localhost:8080").splines(bbox=(11.5, 48.1, 11.6, 48.2)):
+        print(curve.id, curve.sample(step_m=0.5).wgs84)
 """
 
+from ._curves import Anchor, Curve, Samples
 from ._events import Feed, Gap, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials
+from ._map import Cell, Feature, Map
 from ._session import Reconnect, Session
 from ._spool import SpoolOptions, SpoolRecovery
 from ._values import Category, Detection, FieldOfView, GnssFix, Limits, Occlusion, Pose, Sensor
-from .errors import LanemapError, Refused, SessionError, SpoolError, SpoolFull
+from ._watch import Change, Reset, Watch
+from .errors import LanemapError, MapError, MapUnreachable, Refused, SessionError, SpoolError, SpoolFull
 
 __all__ = [
+    "Anchor",
     "Category",
+    "Cell",
+    "Change",
     "Credentials",
+    "Curve",
     "Detection",
+    "Feature",
     "Feed",
     "FieldOfView",
     "Gap",
@@ -27,12 +39,17 @@ __all__ = [
     "LanemapError",
     "Limits",
     "LocalMap",
+    "Map",
+    "MapError",
+    "MapUnreachable",
     "Occlusion",
     "Pose",
     "Reconnect",
     "Refusal",
     "Refused",
+    "Samples",
     "Sensor",
+    "Reset",
     "Session",
     "SessionError",
     "SpoolError",

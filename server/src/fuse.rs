@@ -18,6 +18,7 @@ pub mod follow;
 pub(crate) mod offer;
 pub mod publications;
 mod queue;
+mod retention;
 pub mod shared_map;
 pub mod wire;
 mod worker;
@@ -37,7 +38,7 @@ use tokio::sync::watch;
 
 pub use cell_record::{CellRecord, CellVersion};
 pub(crate) use offer::Offer;
-pub use publications::{MapRevision, RevisionError};
+pub use publications::{MapRevision, Publication, RevisionError};
 pub use shared_map::{ChangesError, KeptVersion, PublishedCell, SharedMap};
 
 use crate::{

@@ -17,7 +17,7 @@ use super::{
     now_ms,
     publications::Publication,
     queue::{Taken, Task, Wanted},
-    wire,
+    retention, wire,
 };
 use crate::{
     journal::{
@@ -334,15 +334,10 @@ impl Worker {
             return Ok(versions.into_iter().map(|(version, _)| version).collect());
         }
         let versions = self.store.versions(cell)?;
-        let since_ms = self.oldest_kept_ms();
-        let excess = versions.len().saturating_sub(MOST_VERSIONS - 1);
-        let replaced_ms = versions.iter().skip(1).map(|(_, published_ms)| *published_ms).chain([u64::MAX]);
-        let outdated = versions
-            .iter()
-            .zip(replaced_ms)
-            .enumerate()
-            .filter(|(index, (_, replaced_ms))| purged || *index < excess || *replaced_ms < since_ms);
-        Ok(outdated.map(|(_, ((version, _), _))| *version).collect())
+        if purged {
+            return Ok(versions.into_iter().map(|(version, _)| version).collect());
+        }
+        Ok(retention::outdated(&versions, MOST_VERSIONS, self.oldest_kept_ms(), now_ms()))
     }
 
     /// Has the neighbours joined again whose border was changed.

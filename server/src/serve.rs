@@ -4,6 +4,8 @@
 //! |---|---|
 //! | `/sessions` | the drives, newest first: state, version, where they are; `limit` |
 //! | `/sessions/{id}/lanes.geojson` | the lanes of one drive in WGS84; `?crs=local`: in metres |
+//! | `/sessions/live` | where the vehicles are that stream now; `bbox`, `limit` |
+//! | `/sessions/{id}/trace.geojson` | where the vehicle of a drive was, and when; `?crs=local`: in metres |
 //! | `/sessions/{id}/lanes.pb` | the same lanes as splines, protobuf `lanemap.v1.LaneMap` |
 //! | `/collections/lanes/items` | the lines of the shared map; `bbox`, `limit` |
 //! | `/collections/drives/items` | the lanes of all georeferenced drives, each as it alone saw them; `bbox`, `limit` |
@@ -11,6 +13,9 @@
 //! | `/cells/{id}` | one of them |
 //! | `/cells/{id}/lanes.geojson` | its lines in WGS84 |
 //! | `/cells/{id}/lanes.pb` | the same as splines, protobuf `lanemap.v1.CellMap` |
+//! | `/cells/{id}/lanes/{lane}/history` | how one of its lines came to be, over the versions that are kept |
+//! | `/differences` | where the map is another one than at a revision: `since`, `bbox` |
+//! | `/timeline` | when the map changed: revisions to go back to; `steps` |
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
 //! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
@@ -23,12 +28,14 @@
 pub mod bounds;
 mod cells;
 mod changes;
+mod difference;
 mod drive_items;
 mod encoding;
 pub mod entity_tag;
 pub mod extents;
 pub mod features;
 mod items;
+mod lane_history;
 mod limits;
 pub mod line;
 pub mod link_base;
@@ -38,11 +45,14 @@ pub mod problem;
 mod query;
 #[cfg(test)]
 pub(crate) mod sample;
+mod session_trace;
 mod sessions;
 mod shared_lanes;
 mod splines;
 mod tile_cache;
 mod tiles;
+mod timeline;
+mod vehicles;
 mod viewer;
 
 use std::{sync::Arc, time::Duration};
@@ -145,6 +155,8 @@ pub fn router(state: ServeState) -> Router {
     let readers = Router::new()
         .route("/sessions", get(sessions::list))
         .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
+        .route("/sessions/live", get(vehicles::live))
+        .route("/sessions/{id}/trace.geojson", get(session_trace::trace_geojson))
         .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
         .route(items::PATH, get(items::items))
         .route(drive_items::PATH, get(drive_items::items))
@@ -152,6 +164,9 @@ pub fn router(state: ServeState) -> Router {
         .route("/cells/{id}", get(cells::one))
         .route("/cells/{id}/lanes.geojson", get(cells::lanes_geojson))
         .route("/cells/{id}/lanes.pb", get(cells::lanes_protobuf))
+        .route("/cells/{id}/lanes/{lane}/history", get(lane_history::history))
+        .route("/differences", get(difference::differences))
+        .route("/timeline", get(timeline::timeline))
         .route("/cells/{id}/changes", get(cells::changes_json))
         .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
         .route("/changes", get(changes::changes))

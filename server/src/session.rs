@@ -13,7 +13,9 @@ pub mod published;
 mod recent;
 pub(crate) mod registry;
 pub(crate) mod reorder;
+pub mod way;
 
 pub use crate::journal::{SessionKey, SessionRecord, SessionSetup};
 pub use id::SessionId;
 pub use published::{MapVersion, PublishedMap, SessionState, SessionSummary, Sessions};
+pub use way::{Way, WayPoint};

@@ -339,6 +339,34 @@ impl SharedMap {
         }
     }
 
+    /// The versions of a cell that are kept, the oldest first, and when each was published, milliseconds since the Unix epoch.
+    /// Reads the store.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn kept_versions(&self, cell: CellId) -> Result<Vec<(CellVersion, u64)>, JournalError> {
+        let store = self.shared.store.load_full().ok_or(JournalError::Closed)?;
+        Ok(store
+            .versions(cell)?
+            .into_iter()
+            .map(|(version, published_ms)| (CellVersion(version), published_ms))
+            .collect())
+    }
+
+    /// A version of a cell, or the nearest before it that is kept, or else the oldest that is: what the cell was like, for
+    /// whoever looks back. Reads the store.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn version_near(&self, cell: CellId, version: CellVersion) -> Result<Option<Arc<KeptVersion>>, JournalError> {
+        if let Some(found) = self.version_of(cell, version)? {
+            return Ok(Some(found));
+        }
+        let kept = self.kept_versions(cell)?;
+        let near = kept.iter().rev().find(|(kept, _)| *kept <= version).or(kept.first());
+        near.map_or(Ok(None), |(near, _)| self.version_of(cell, *near))
+    }
+
     /// One version of a cell, where it is kept; version 0 is empty.
     fn version(&self, cell: CellId, version: u64) -> Result<Option<v1::CellMap>, JournalError> {
         if version == 0 {

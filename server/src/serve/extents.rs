@@ -71,7 +71,7 @@ mod tests {
         let map = placed(published(1, 3), georeference(11.58, 48.14));
         let three_lanes = extents.of(&map).unwrap();
         let summary = SessionSummary { version: MapVersion(map.version.0 + 1), ..map.summary };
-        let map = PublishedMap::new(summary, Arc::new(LaneMap { lanes: map.map.lanes[..1].to_vec() }));
+        let map = PublishedMap::new(summary, Arc::new(LaneMap { lanes: map.map.lanes[..1].to_vec() }), map.way);
         let one_lane = extents.of(&map).unwrap();
         assert!(one_lane.west > three_lanes.west, "lanes lie side by side, to the west");
     }

@@ -41,6 +41,14 @@ pub enum Problem {
         /// The name in the address.
         cell: String,
     },
+    /// The address names a line that was in no version of its cell that is kept.
+    #[error("cell {cell} has no line {lane:?}, nor had it in any version that is kept")]
+    NoSuchLane {
+        /// The cell.
+        cell: String,
+        /// The name in the address.
+        lane: String,
+    },
     /// The address names a tile that is none, or is not served.
     #[error("there is no tile {tile:?} here: {limit}")]
     NoSuchTile {
@@ -204,6 +212,7 @@ impl Problem {
             Self::NoSuchPath { .. }
             | Self::NoSuchSession { .. }
             | Self::NoSuchCell { .. }
+            | Self::NoSuchLane { .. }
             | Self::NoSuchTile { .. }
             | Self::NoSuchCollection { .. }
             | Self::NoSuchFeature { .. } => StatusCode::NOT_FOUND,
@@ -247,6 +256,7 @@ impl Problem {
             Self::MethodNotAllowed { .. } => ("method-not-allowed", "Method not allowed"),
             Self::NoSuchSession { .. } => ("no-such-session", "No such session"),
             Self::NoSuchCell { .. } => ("no-such-cell", "No such cell"),
+            Self::NoSuchLane { .. } => ("no-such-lane", "No such line"),
             Self::NoSuchTile { .. } => ("no-such-tile", "No such tile"),
             Self::VersionNotKept { .. } => ("version-not-kept", "The version is not kept"),
             Self::NotGeoreferenced { .. } => ("not-georeferenced", "The session is not georeferenced"),

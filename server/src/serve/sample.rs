@@ -11,7 +11,7 @@ use lanemap_core::{
 };
 use nalgebra::{Matrix3, Point3, Translation3, UnitQuaternion};
 
-use crate::session::{MapVersion, PublishedMap, SessionId, SessionState, SessionSummary};
+use crate::session::{MapVersion, PublishedMap, SessionId, SessionState, SessionSummary, Way};
 
 /// Control points 3 m apart on a circle that climbs a little.
 pub fn bend(radius_m: f64, count: usize) -> Vec<Point3<f64>> {
@@ -64,12 +64,13 @@ pub fn published(number: u64, lanes: u64) -> PublishedMap {
         last_time: TimestampNs(1_700_000_001_200_000_000),
         georeference: None,
     };
-    PublishedMap::new(summary, Arc::new(LaneMap { lanes }))
+    PublishedMap::new(summary, Arc::new(LaneMap { lanes }), Way::default())
 }
 
 /// The same map at a place on the earth.
 pub fn placed(published: PublishedMap, georeference: Georeference) -> PublishedMap {
-    PublishedMap::new(SessionSummary { georeference: Some(georeference), ..published.summary }, published.map)
+    let summary = SessionSummary { georeference: Some(georeference), ..published.summary };
+    PublishedMap::new(summary, published.map, published.way)
 }
 
 /// A map frame at a place, 520 m high, turned by a quarter: its x axis points north.

@@ -83,10 +83,10 @@ struct Entry {
 
 /// Where the vehicle of a session was at its last frame. It has no name here.
 #[derive(Debug, PartialEq, Serialize)]
-struct Vehicle {
-    position: Coordinate,
+pub(super) struct Vehicle {
+    pub(super) position: Coordinate,
     /// Clockwise from north, or from the y axis of the map frame, degrees in `[0, 360)`.
-    heading_deg: f64,
+    pub(super) heading_deg: f64,
 }
 
 /// `GET /sessions`
@@ -139,11 +139,13 @@ fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionI
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
         link("lanes-local", GEOJSON, "lanes.geojson?crs=local"),
+        link("trace-local", GEOJSON, "trace.geojson?crs=local"),
         link("splines", PROTOBUF, "lanes.pb"),
         Link { rel: "viewer", media_type: "text/html", href: base.link(&format!("/viewer?session={}", map.session)) },
     ];
     if map.georeference.is_some() {
         links.insert(0, link("lanes", GEOJSON, "lanes.geojson"));
+        links.insert(1, link("trace", GEOJSON, "trace.geojson"));
     }
     Entry {
         id: map.session.to_string(),
@@ -172,7 +174,7 @@ fn border(map: &SessionSummary, extents: &Extents) -> Option<[f64; 4]> {
     Some([low[0], low[1], high[0], high[1]])
 }
 
-fn vehicle(map: &SessionSummary) -> Vehicle {
+pub(super) fn vehicle(map: &SessionSummary) -> Vehicle {
     let Some(georeference) = &map.georeference else {
         let (east, north) = forward(&map.map_from_vehicle);
         return Vehicle { position: in_metres(&origin(&map.map_from_vehicle)), heading_deg: heading_deg(east, north) };
@@ -192,13 +194,15 @@ fn forward(map_from_vehicle: &Isometry3<f64>) -> (f64, f64) {
     (ahead.x, ahead.y)
 }
 
-fn bearing_deg(from: &Wgs84, to: &Wgs84) -> f64 {
+/// Direction from one place to another near by, clockwise from north, degrees in `[0, 360)`.
+pub(super) fn bearing_deg(from: &Wgs84, to: &Wgs84) -> f64 {
     let across = to.longitude_deg - from.longitude_deg;
     let east = (across - 360.0 * (across / 360.0).round()) * from.latitude_deg.to_radians().cos();
     heading_deg(east, to.latitude_deg - from.latitude_deg)
 }
 
-fn heading_deg(east: f64, north: f64) -> f64 {
+/// Direction of a vector, clockwise from north, degrees in `[0, 360)`.
+pub(super) fn heading_deg(east: f64, north: f64) -> f64 {
     rounded(east.atan2(north).to_degrees().rem_euclid(360.0), 10.0) % 360.0
 }
 
@@ -243,7 +247,7 @@ pub(super) async fn lanes_protobuf(
 }
 
 /// The map of a session; where the session sleeps, it is read from the store.
-async fn find(sessions: &Sessions, id: &str) -> Result<Arc<PublishedMap>, Problem> {
+pub(super) async fn find(sessions: &Sessions, id: &str) -> Result<Arc<PublishedMap>, Problem> {
     let found = match id.parse() {
         Ok(session) => {
             let sessions = sessions.clone();

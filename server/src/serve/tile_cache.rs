@@ -22,9 +22,9 @@ use lanemap_core::fleet::CellId;
 use lanemap_tiles::{ProjectedCell, TileId, vector_tile};
 use quick_cache::{Weighter, sync::Cache};
 
-use super::{entity_tag::EntityTag, in_background, problem::Problem};
+use super::{entity_tag::EntityTag, in_background, problem::Problem, timeline::not_at_revision};
 use crate::{
-    fuse::{CellVersion, SharedMap},
+    fuse::{CellVersion, MapRevision, SharedMap},
     journal::JournalError,
 };
 
@@ -128,6 +128,46 @@ impl TileCache {
             }
         }
         Err(JournalError::Store(format!("the cells of tile {tile} change faster than they can be read")).into())
+    }
+
+    /// The answer to a request for a tile of the map as it was at a revision, or nearly so: see [`SharedMap::version_near`].
+    ///
+    /// Which versions those are is asked of the store each time: one of which a drive was deleted is shown no more.
+    pub(super) async fn answer_at(
+        &self,
+        kind: TileKind,
+        tile: TileId,
+        revision: MapRevision,
+        media_type: &'static str,
+        request: &HeaderMap,
+    ) -> Result<Response, Problem> {
+        for _ in 0..ATTEMPTS {
+            let cache = self.clone();
+            let cells = in_background(move || cache.cells_at(tile, revision)).await??;
+            let version = TileVersion { kind, tile, cells };
+            let tag = EntityTag::of(&version);
+            if tag.is_held_by(request) {
+                return Ok(tag.not_modified());
+            }
+            match self.made(version, tag).await {
+                Ok(made) => return made.response(media_type, request).await,
+                Err(MakeError::Outdated) => {}
+                Err(MakeError::Store(error)) => return Err(error.into()),
+            }
+        }
+        Err(JournalError::Store(format!("the cells of tile {tile} change faster than they can be read")).into())
+    }
+
+    /// The cells with lines that a tile touches, as they were at a revision.
+    fn cells_at(&self, tile: TileId, revision: MapRevision) -> Result<Vec<(CellId, CellVersion)>, Problem> {
+        let versions = self.map.versions_at(revision).map_err(|error| not_at_revision("revision", error))?;
+        let mut cells = Vec::new();
+        for cell in tile.cells_touched() {
+            let Some(version) = versions.get(&cell) else { continue };
+            let near = self.map.version_near(cell, *version)?.filter(|near| !near.map.lanes.is_empty());
+            cells.extend(near.map(|near| (cell, CellVersion(near.map.version))));
+        }
+        Ok(cells)
     }
 
     /// The cells with lines that a tile touches, as they are now.

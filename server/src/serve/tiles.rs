@@ -23,6 +23,8 @@ use super::{
     tile_cache::{TileCache, TileKind},
 };
 
+use crate::fuse::MapRevision;
+
 /// Media type of a vector tile.
 pub(super) const VECTOR_TILE: &str = "application/vnd.mapbox-vector-tile";
 /// Path of the TileJSON; tiles lie below it.
@@ -56,17 +58,20 @@ struct VectorLayer {
     fields: BTreeMap<&'static str, &'static str>,
 }
 
-/// `GET /tiles/lanes/{z}/{x}/{y}`, also with `.mvt` or `.pbf` behind it.
+/// `GET /tiles/lanes/{z}/{x}/{y}`, also with `.mvt` or `.pbf` behind it; `revision`: as the map was.
 pub(super) async fn tile(
     State(cache): State<TileCache>,
     Path((z, x, y)): Path<(String, String, String)>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    Parameters::read(&uri, &[])?;
+    let revision = Parameters::read(&uri, &["revision"])?.get("revision", str::parse::<MapRevision>)?;
     let row = y.strip_suffix(".mvt").or_else(|| y.strip_suffix(".pbf")).unwrap_or(&y);
     let tile = named([&z, &x, row], VECTOR_ZOOMS)?;
-    cache.answer(TileKind::Vector, tile, VECTOR_TILE, &headers).await
+    match revision {
+        None => cache.answer(TileKind::Vector, tile, VECTOR_TILE, &headers).await,
+        Some(revision) => cache.answer_at(TileKind::Vector, tile, revision, VECTOR_TILE, &headers).await,
+    }
 }
 
 /// The tile of an address, where its zoom is served.

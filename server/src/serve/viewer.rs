@@ -12,9 +12,9 @@ use super::{
     problem::{Problem, repeated},
 };
 
-/// The page asks nothing of other hosts, and a browser holds it to that. MapLibre styles its elements inline.
-const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; worker-src 'self' blob:; connect-src 'self'; \
-     img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; base-uri 'none'; form-action 'none'";
+/// The page asks nothing of other hosts, and a browser holds it to that.
+const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; worker-src 'self'; connect-src 'self'; \
+     img-src 'self' data: blob:; style-src 'self'; font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
 /// `GET /viewer`
 pub(super) async fn page(headers: HeaderMap, uri: Uri) -> Result<Response, Problem> {

@@ -13,6 +13,7 @@ use thiserror::Error;
 use super::{
     MapVersion, PublishedMap, SessionId, SessionRecord, SessionSetup, SessionState, SessionSummary,
     recent::{REMEMBERED, RecentFrames, Recollection},
+    way::Way,
 };
 use crate::{
     fuse::Offer,
@@ -30,6 +31,8 @@ pub(crate) struct Drive {
     mapper: Mapper,
     /// The way so far, of what was mapped.
     trace: Arc<Trace>,
+    /// The same for readers.
+    way: Way,
     progress: Progress,
     cut: TripCut,
     ends: Ends,
@@ -198,7 +201,7 @@ impl Drive {
     pub(crate) fn new(setup: &SessionSetup, cut: TripCut) -> Self {
         let mapper = Mapper::new(Params::preset(setup.preset), setup.sensor);
         let (progress, ends) = (Progress::default(), Ends::default());
-        Self { mapper, trace: Arc::default(), progress, cut, ends, mapped: None }
+        Self { mapper, trace: Arc::default(), way: Way::default(), progress, cut, ends, mapped: None }
     }
 
     /// The drive of [`Drive::snapshot`]'s bytes.
@@ -207,8 +210,9 @@ impl Drive {
         // Snapshots of earlier builds end here, or after the next part.
         let (ends, rest) = part_of(rest)?;
         let (trace, _) = part_of::<TracePart>(rest)?;
-        let mapped = progress.last;
-        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace.read()), progress, cut, ends, mapped })
+        let (trace, mapped) = (trace.read(), progress.last);
+        let way = Way::of(&trace);
+        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace), way, progress, cut, ends, mapped })
     }
 
     /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
@@ -292,6 +296,7 @@ impl Drive {
         }
         let report = self.mapper.step(frame);
         Arc::make_mut(&mut self.trace).observe(frame, &self.mapper.map_from_vehicle());
+        self.way.follow(&self.trace);
         report
     }
 
@@ -393,7 +398,7 @@ impl Drive {
             lanes: 0,
             extent: None,
         };
-        PublishedMap::new(summary, Arc::new(self.mapper.lane_map()))
+        PublishedMap::new(summary, Arc::new(self.mapper.lane_map()), self.way.clone())
     }
 
     /// What the drive, by this name, says to the shared map with what it publishes.

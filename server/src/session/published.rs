@@ -26,7 +26,10 @@ use quick_cache::{Weighter, sync::Cache};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
-use super::id::SessionId;
+use super::{
+    id::SessionId,
+    way::{Way, WayPoint},
+};
 use crate::journal::{JournalError, SessionRecord};
 
 /// Version of a session's map: the number of frames in it. The same version of a session always has the same map.
@@ -108,19 +111,21 @@ pub struct PublishedMap {
     pub summary: SessionSummary,
     /// The lanes, map frame, metres.
     pub map: Arc<LaneMap>,
+    /// Where the vehicle has been.
+    pub way: Way,
 }
 
 impl PublishedMap {
     /// A map and its summary, whose number and extent of the lanes are filled in.
     #[must_use]
-    pub fn new(mut summary: SessionSummary, map: Arc<LaneMap>) -> Self {
+    pub fn new(mut summary: SessionSummary, map: Arc<LaneMap>, way: Way) -> Self {
         let points = map.lanes.iter().flat_map(|lane| lane.control_points.iter().map(|point| point.position));
         summary.extent = match &summary.georeference {
             Some(georeference) => extent(points.map(|point| georeference.enu_from_map * point)),
             None => extent(points),
         };
         summary.lanes = map.lanes.len();
-        Self { summary, map }
+        Self { summary, map, way }
     }
 }
 
@@ -170,7 +175,8 @@ struct MemoryWeight;
 impl Weighter<(SessionId, MapVersion), Arc<PublishedMap>> for MemoryWeight {
     fn weight(&self, _: &(SessionId, MapVersion), published: &Arc<PublishedMap>) -> u64 {
         let points: usize = published.map.lanes.iter().map(|lane| lane.control_points.len()).sum();
-        let bytes = size_of::<PublishedMap>() + 256 * published.map.lanes.len() + size_of::<ControlPoint>() * points;
+        let lanes = 256 * published.map.lanes.len() + size_of::<ControlPoint>() * points;
+        let bytes = size_of::<PublishedMap>() + lanes + size_of::<WayPoint>() * published.way.len();
         bytes as u64
     }
 }
@@ -272,7 +278,7 @@ impl Sessions {
         if let Some(awake) = entry.awake.swap(None) {
             let summary = SessionSummary { state, ..awake.summary.clone() };
             entry.summary.store(Arc::new(summary.clone()));
-            let asleep = Arc::new(PublishedMap { summary, map: Arc::clone(&awake.map) });
+            let asleep = Arc::new(PublishedMap { summary, map: Arc::clone(&awake.map), way: awake.way.clone() });
             self.shared.asleep.insert((session, asleep.version), asleep);
         }
     }
@@ -342,7 +348,7 @@ mod tests {
     fn map(session: SessionId, version: u64) -> PublishedMap {
         let published = sample::published(1, 2);
         let summary = SessionSummary { session, version: MapVersion(version), ..published.summary };
-        PublishedMap::new(summary, published.map)
+        PublishedMap::new(summary, published.map, published.way)
     }
 
     #[test]

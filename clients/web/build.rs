@@ -1,4 +1,5 @@
-//! Gathers the viewer's files into one table: those of `page/` as they stand, and MapLibre as npm installs it.
+//! Gathers the viewer's files into one table: those of `page/` as they stand, and MapLibre and the typeface Inter as npm
+//! installs them.
 //!
 //! npm writes into `OUT_DIR` only, from the committed lock file. Where npm is missing or fails the crate still builds,
 //! with a warning, and the page tells its reader how to get the map drawn.
@@ -14,12 +15,14 @@ use std::{
     process::Command,
 };
 
-/// What the page takes of MapLibre, by its name in the package and its name beside the page.
-const MAPLIBRE: [(&str, &str); 4] = [
-    ("dist/maplibre-gl.mjs", "maplibre-gl.mjs"),
-    ("dist/maplibre-gl-worker.mjs", "maplibre-gl-worker.mjs"),
-    ("dist/maplibre-gl.css", "maplibre-gl.css"),
-    ("LICENSE.txt", "maplibre-gl-license.txt"),
+/// What the page takes of packages: the name in the folder of packages, and the name beside the page.
+const FROM_NPM: [(&str, &str); 6] = [
+    ("maplibre-gl/dist/maplibre-gl.mjs", "maplibre-gl.mjs"),
+    ("maplibre-gl/dist/maplibre-gl-worker.mjs", "maplibre-gl-worker.mjs"),
+    ("maplibre-gl/dist/maplibre-gl.css", "maplibre-gl.css"),
+    ("maplibre-gl/LICENSE.txt", "maplibre-gl-license.txt"),
+    ("@fontsource-variable/inter/files/inter-latin-wght-normal.woff2", "inter.woff2"),
+    ("@fontsource-variable/inter/LICENSE", "inter-license.txt"),
 ];
 
 /// Settings and lock of npm, copied beside what it installs.
@@ -35,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
 
     let mut files = page_files(&crate_dir.join("page"))?;
-    match install_maplibre(&crate_dir, &out_dir.join("npm")) {
+    match install(&crate_dir, &out_dir.join("npm")) {
         Ok(installed) => files.extend(installed),
         Err(reason) => {
             println!(
@@ -62,7 +65,7 @@ fn page_files(page: &Path) -> Result<Vec<File>, Box<dyn Error>> {
         .collect()
 }
 
-fn install_maplibre(crate_dir: &Path, npm_dir: &Path) -> Result<Vec<File>, Box<dyn Error>> {
+fn install(crate_dir: &Path, npm_dir: &Path) -> Result<Vec<File>, Box<dyn Error>> {
     fs::create_dir_all(npm_dir)?;
     for input in NPM_INPUTS {
         fs::copy(crate_dir.join(input), npm_dir.join(input))?;
@@ -77,12 +80,12 @@ fn install_maplibre(crate_dir: &Path, npm_dir: &Path) -> Result<Vec<File>, Box<d
         let complaint = String::from_utf8_lossy(&output.stderr);
         return Err(format!("npm ci failed: {}", complaint.lines().next().unwrap_or("no reason given")).into());
     }
-    let package = npm_dir.join("node_modules/maplibre-gl");
-    MAPLIBRE
+    let packages = npm_dir.join("node_modules");
+    FROM_NPM
         .into_iter()
         .map(|(inside, name)| {
-            let path = package.join(inside);
-            fs::metadata(&path).map_err(|error| format!("{inside} of maplibre-gl: {error}"))?;
+            let path = packages.join(inside);
+            fs::metadata(&path).map_err(|error| format!("{inside}: {error}"))?;
             Ok((name.to_owned(), path))
         })
         .collect()
@@ -112,6 +115,7 @@ fn content_type(name: &str) -> Result<&'static str, String> {
         Some("css") => Ok("text/css; charset=utf-8"),
         Some("js" | "mjs") => Ok("text/javascript; charset=utf-8"),
         Some("svg") => Ok("image/svg+xml"),
+        Some("woff2") => Ok("font/woff2"),
         Some("txt") => Ok("text/plain; charset=utf-8"),
         _ => Err(format!("page/{name} has no known content type")),
     }

@@ -1,109 +1,111 @@
-// The feed: which sessions there are, the cells of the shared map, and the lanes of those that changed. Polls, and fetches
-// nothing twice.
+// The feed: what there is on the server now. Looks once a second, and fetches nothing that did not change.
+//
+// Cells are looked at when the server says on `/changes` that one did; where that stream is not to be had, once a second.
 
-const PERIOD_MS = 1000;
-const LONGEST_PAUSE_MS = 15000;
+/** Drives that are listed. */
+const DRIVES = 60;
+/** Rounds from one look at what changes slowly to the next. */
+const SLOWLY = 3;
+/** Time that changes get to become more before they are looked at, milliseconds. */
+const GATHER_MS = 250;
+/** Pause before the stream of changes is opened again, milliseconds. */
+const AGAIN_MS = 3000;
 
 export class Feed {
-  /** The sessions as the server last listed them, each with its number in the order in which they began. */
-  sessions = [];
-  /** The cells of the shared map as the server last listed them. */
+  /** The cells of the shared map. */
   cells = [];
-  /** What of each session and each cell was fetched last: its version and frame of reference. */
-  #fetched = new Map();
-  /** The entity tag of each address, for conditional requests. */
-  #tags = new Map();
+  /** The newest drives, each with its number in the order in which they began. */
+  drives = [];
+  /** How many drives there are. */
+  total = 0;
+  /** The vehicles that stream now, GeoJSON features. */
+  vehicles = [];
+  #server;
+  #past;
   #on;
-  #wake = () => {};
+  #round = 0;
+  #versions;
+  /** Whether the server tells what changes, and whether it told of something that was not looked at yet. */
+  #following = false;
+  #stale = true;
+  #lastId;
+  #soon;
 
   /**
-   * `on.sessions(list, total)` is called when the list changed, `on.lanes(session, collection)` when a session's lanes did,
-   * `on.cell(cell, collection)` when a cell's did, `on.gone(id)` when a session left the list, `on.connection(state)` with
-   * "connected" or "lost"; `on.wants(session)` and `on.wantsCell(cell)` say whether its lanes are drawn at all.
+   * `on.cells(changed)` is called with the cells whose version is another one, `on.drives()`, `on.vehicles(totals)` and
+   * `on.past()` when theirs changed, `on.round()` after each look.
    */
-  constructor(on) {
+  constructor(server, past, on) {
+    this.#server = server;
+    this.#past = past;
     this.#on = on;
   }
 
-  /** Polls for ever, slower while the server does not answer, and not at all while the page is hidden. */
-  async run() {
-    for (let pause = PERIOD_MS; ; ) {
-      await untilVisible();
+  /** Everything is to be fetched anew: the server was away. */
+  forget() {
+    this.#server.forget();
+    this.#round = 0;
+    this.#versions = undefined;
+    this.#stale = true;
+  }
+
+  async look() {
+    const vehicles = await this.#server.changed("sessions/live?limit=2000");
+    if (vehicles) {
+      this.vehicles = vehicles.features;
+      this.#on.vehicles({ live: vehicles.live, drives: vehicles.drives });
+    }
+    // Drives first: where they were tells what to look at.
+    if (this.#round % SLOWLY === 0) await this.#lookAtDrives();
+    if (this.#stale || !this.#following) await this.#lookAtCells();
+    if (this.#round % SLOWLY === 0 && await this.#past.look()) this.#on.past();
+    this.#round += 1;
+    this.#on.round();
+  }
+
+  /** Listens to what changes, for ever. */
+  async follow() {
+    for (;;) {
       try {
-        await this.#poll();
-        this.#on.connection("connected");
-        pause = PERIOD_MS;
+        await this.#server.follow("changes", (name, _, id) => this.#hear(name, id), { lastId: this.#lastId });
       } catch (error) {
-        console.warn("the server does not answer:", error.message);
-        this.#on.connection("lost");
-        pause = Math.min(pause * 2, LONGEST_PAUSE_MS);
+        // Too many listen, or the server is away: it is asked once a second, and this again later.
+        if (error.status === 400) this.#lastId = undefined;
       }
-      await new Promise((resume) => {
-        this.#wake = resume;
-        setTimeout(resume, pause);
-      });
+      this.#following = false;
+      await new Promise((resume) => setTimeout(resume, AGAIN_MS));
     }
   }
 
-  /** Polls now: another session is wanted. */
-  hurry() {
-    this.#wake();
+  #hear(name, id) {
+    this.#following = true;
+    this.#lastId = id ?? this.#lastId;
+    // Also at the start: what changed since the cells were listed is not told.
+    if (!["start", "cell", "reset"].includes(name)) return;
+    this.#stale = true;
+    this.#soon ??= setTimeout(() => {
+      this.#soon = undefined;
+      this.#server.hurry();
+    }, GATHER_MS);
   }
 
-  async #poll() {
-    const list = await this.#fetchChanged("sessions");
-    if (list) {
-      // The list has the newest first, and may be the end of a longer one.
-      this.sessions = list.sessions.map((session, index) => ({ ...session, number: list.total - index }));
-      this.#forgetGone();
-      this.#on.sessions(this.sessions, list.total);
-    }
-    for (const session of this.sessions) {
-      const state = `${session.version} ${session.georeferenced}`;
-      if (this.#fetched.get(session.id) === state || !this.#on.wants(session)) continue;
-      const lanes = await this.#fetchChanged(lanesOf(session.id, session.georeferenced));
-      if (lanes) this.#on.lanes(session, lanes);
-      this.#fetched.set(session.id, state);
-    }
-    this.cells = (await this.#fetchChanged("cells"))?.cells ?? this.cells;
-    for (const cell of this.cells) {
-      if (this.#fetched.get(cell.id) === cell.version || !this.#on.wantsCell(cell)) continue;
-      const lanes = await this.#fetchChanged(`cells/${cell.id}/lanes.geojson`);
-      if (lanes) this.#on.cell(cell, lanes);
-      this.#fetched.set(cell.id, cell.version);
-    }
+  async #lookAtCells() {
+    this.#stale = false;
+    const list = await this.#server.changed("cells?limit=10000");
+    if (!list) return;
+    const versions = this.#versions;
+    this.#versions = new Map(list.cells.map(({ id, version }) => [id, version]));
+    this.cells = list.cells;
+    // Tiles that are asked for from now on have what is told first.
+    this.#on.cells(versions ? list.cells.filter(({ id, version }) => versions.get(id) !== version) : []);
   }
 
-  #forgetGone() {
-    const alive = new Set([...this.sessions, ...this.cells].map(({ id }) => id));
-    for (const id of [...this.#fetched.keys()].filter((id) => !alive.has(id))) {
-      this.#fetched.delete(id);
-      for (const georeferenced of [true, false]) this.#tags.delete(lanesOf(id, georeferenced));
-      this.#on.gone(id);
-    }
+  async #lookAtDrives() {
+    const list = await this.#server.changed(`sessions?limit=${DRIVES}`);
+    if (!list) return;
+    this.total = list.total;
+    // The newest come first.
+    this.drives = list.sessions.map((session, index) => ({ ...session, number: list.total - index }));
+    this.#on.drives();
   }
-
-  /** The JSON at `path`, or `undefined` where it did not change since the last call or the server refuses it. */
-  async #fetchChanged(path) {
-    const tag = this.#tags.get(path);
-    const response = await fetch(path, { cache: "no-store", headers: tag ? { "If-None-Match": tag } : {} });
-    if (response.status === 304) return undefined;
-    if (!response.ok) {
-      this.#tags.delete(path);
-      if (path === "sessions" || path === "cells") throw new Error(`${path} answers ${response.status}`);
-      return undefined;
-    }
-    const body = await response.json();
-    this.#tags.set(path, response.headers.get("ETag"));
-    return body;
-  }
-}
-
-function lanesOf(id, georeferenced) {
-  return `sessions/${encodeURIComponent(id)}/lanes.geojson${georeferenced ? "" : "?crs=local"}`;
-}
-
-function untilVisible() {
-  if (!document.hidden) return undefined;
-  return new Promise((resume) => document.addEventListener("visibilitychange", resume, { once: true }));
 }

@@ -28,14 +28,29 @@ export function joinBoxes(boxes) {
   return [0, 1, 2, 3].map((side) => (side < 2 ? Math.min : Math.max)(...boxes.map((box) => box[side])));
 }
 
+/** Distance on the ground between two places `[longitude, latitude]` near each other, metres; heights aside. */
+export function distance(from, to) {
+  const latitude = ((from[1] + to[1]) / 2) * (Math.PI / 180);
+  return METRES_PER_DEGREE * Math.hypot((to[0] - from[0]) * Math.cos(latitude), to[1] - from[1]);
+}
+
 /** Length on the ground of a GeoJSON geometry of lines, metres; heights aside. */
 export function lengthOf({ type, coordinates }) {
   const lines = type === "MultiLineString" ? coordinates : [coordinates];
-  const step = (from, to) => {
-    const east = (to[0] - from[0]) * Math.cos((to[1] * Math.PI) / 180);
-    return METRES_PER_DEGREE * Math.hypot(east, to[1] - from[1]);
+  const lengths = lines.flatMap((line) => line.slice(1).map((to, index) => distance(line[index], to)));
+  return lengths.reduce((sum, length) => sum + length, 0);
+}
+
+/** The smallest box `[west, south, east, north]` around the coordinates of GeoJSON geometries, or `undefined`. */
+export function boxOf(geometries) {
+  const box = [Infinity, Infinity, -Infinity, -Infinity];
+  const visit = (coordinates) => {
+    if (typeof coordinates[0] !== "number") return coordinates.forEach(visit);
+    const [x, y] = coordinates;
+    return Object.assign(box, [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y)]);
   };
-  return lines.flatMap((line) => line.slice(1).map((to, index) => step(line[index], to))).reduce((sum, length) => sum + length, 0);
+  for (const geometry of geometries) visit(geometry.coordinates ?? []);
+  return box[0] <= box[2] ? box : undefined;
 }
 
 /** Degrees of latitude, and of longitude at `latitude`, that `metres` span. */

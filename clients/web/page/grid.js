@@ -45,7 +45,7 @@ export function gridLayers(colours) {
     id: "grid",
     type: "line",
     source: "grid",
-    paint: { "line-color": ["case", ["get", "major"], colours.gridMajor, colours.grid], "line-width": 1 },
+    paint: { "line-color": ["case", ["get", "major"], colours["grid-major"], colours.grid], "line-width": 1 },
   }];
 }
 

@@ -1,39 +1,52 @@
-// The map: MapLibre with the lanes, the vehicles and the grid as its sources.
+// The map: MapLibre with the lines of the shared map as vector tiles, and what lies over them.
 
 import * as maplibre from "./maplibre-gl.mjs";
-import { joinBoxes, lengthOf, placeLocal, placeLocalBox, placeLocalGeometry } from "./geometry.js";
-import { Grid, gridLayers } from "./grid.js";
-import { CLICKABLE, laneLayers, theme } from "./paint.js";
-import { SESSION_COLOURS, colourIndex } from "./panel.js";
+import { joinBoxes } from "./geometry.js";
+import { Grid } from "./grid.js";
+import { TILES_FROM, isClickable, layersOf } from "./layers.js";
+import { colours, moving, onTheme } from "./theme.js";
+import { vehicleIcons } from "./vehicles.js";
 
 const EMPTY = { type: "FeatureCollection", features: [] };
 /** Full precision at every zoom: a lane is drawn where it lies, not where a tile's grid has a place for it. */
-const EXACT = { type: "geojson", maxzoom: 24, tolerance: 0, data: EMPTY };
-/** Farther out than this a road is thinner than a pixel, and its lanes are not fetched. */
-const FARTHEST_ZOOM = 8;
+const EXACT = { type: "geojson", maxzoom: 22, tolerance: 0, data: EMPTY };
+/** Last zoom of vector tiles; farther in, theirs are drawn larger. */
+const TILES_TO = 20;
 /** How far from a line a click still means it, pixels. */
-const REACH_PX = 6;
+const REACH_PX = 8;
 
 export class LaneMap {
   /** Resolves once the style is drawn. */
   ready;
-  /** What is drawn, by session and by cell: the keys of its lines and their length together. */
-  #drawn = new Map();
-  #chosen;
-  #local = false;
-  #latitude = 0;
+  /** MapLibre's own. */
+  map;
+  #view = { layer: "paint", latitude: 0, nowS: Date.now() / 1000 };
+  #layers = [];
   #grid = new Grid();
-  #map;
+  #server;
+  /** The revision of the map that tiles are asked for; the newest where there is none. */
+  #revision;
 
-  /** `on.moved()` is called when the user moves the map, `on.dragged()` when by dragging it. */
-  constructor(container, on) {
-    const colours = theme();
-    this.#map = new maplibre.Map({
+  /**
+   * `on.moved()` is called when the user moves the map, `on.dragged()` when by dragging it, `on.clicked(feature, place)` when
+   * it is clicked, `on.pointed(place)` when the pointer moves over it, `on.failed(error)` when a tile cannot be had.
+   */
+  constructor(container, server, on) {
+    this.#server = server;
+    this.#layers = layersOf(this.#view, colours());
+    this.map = new maplibre.Map({
       container,
+      hash: "at",
       style: {
         version: 8,
-        sources: { lanes: { ...EXACT, promoteId: "key" }, vehicles: EXACT, grid: EXACT },
-        layers: [{ id: "ground", type: "background" }, ...this.#layers(colours)],
+        sources: {
+          lanes: {
+            type: "vector", tiles: [`${server.address("tiles/lanes/")}{z}/{x}/{y}`],
+            minzoom: TILES_FROM, maxzoom: TILES_TO,
+          },
+          cells: EXACT, drive: EXACT, trace: EXACT, changes: EXACT, truth: EXACT, ruler: EXACT, vehicles: EXACT, grid: EXACT,
+        },
+        layers: this.#layers,
       },
       center: [0, 0],
       zoom: 2,
@@ -42,275 +55,223 @@ export class LaneMap {
       renderWorldCopies: false,
       attributionControl: false,
       fadeDuration: 0,
+      // A tile that is out of sight would not be told that it changed.
+      maxTileCacheSize: 0,
+      maxTileCacheZoomLevels: 0,
+      transformRequest: (url, kind) => (kind === "Tile" ? this.#tileRequest(url) : { url }),
     });
-    this.#map.addControl(new maplibre.ScaleControl({ maxWidth: 140 }), "bottom-right");
-    this.#map.addControl(new maplibre.NavigationControl({ visualizePitch: true }), "top-right");
-    this.#map.on("move", ({ originalEvent }) => originalEvent && on.moved());
-    this.#map.on("dragstart", on.dragged);
-    this.#map.on("click", (event) => this.#explain(event));
-    this.#map.on("mousemove", ({ point }) => {
-      this.#map.getCanvas().style.cursor = this.#lineAt(point) ? "pointer" : "";
+    this.map.addControl(new maplibre.NavigationControl({ visualizePitch: true }), "top-right");
+    this.map.addControl(new maplibre.ScaleControl({ maxWidth: 120 }), "bottom-right");
+    this.map.on("error", ({ error }) => on.failed(error));
+    this.map.on("move", ({ originalEvent }) => originalEvent && on.moved());
+    this.map.on("dragstart", on.dragged);
+    this.map.on("click", ({ point, lngLat }) => on.clicked(this.lineAt(point), [lngLat.lng, lngLat.lat]));
+    this.map.on("mousemove", ({ point, lngLat }) => {
+      on.pointed([lngLat.lng, lngLat.lat]);
+      this.map.getCanvas().style.cursor = this.busy ? "crosshair" : this.lineAt(point) ? "pointer" : "";
     });
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#restyle());
-    this.ready = this.#map.once("load").then(() => {
-      SESSION_COLOURS.forEach((colour, index) => {
-        this.#map.addImage(`vehicle-${index}`, arrow(colour), { pixelRatio: 2 });
-      });
-      this.#restyle();
+    onTheme(() => this.show({}));
+    this.ready = this.map.once("load").then(() => {
+      for (const [name, image] of vehicleIcons()) this.map.addImage(name, image, { pixelRatio: 2 });
+      this.show({});
       this.#moved();
-      this.#map.on("move", () => this.#moved());
+      this.map.on("move", () => this.#moved());
     });
   }
 
-  /** Draws a session's lanes in place of those drawn before; hands over only that session's lines. */
-  showLanes(session, collection) {
-    const features = collection.features.map(({ geometry, properties, id }) => ({
-      type: "Feature",
-      geometry: session.georeferenced ? geometry : placeLocalGeometry(geometry),
-      properties: { ...properties, key: String(id), local: !session.georeferenced },
-    }));
-    this.#show(session.id, features);
+  /** Shows what is given in place of what was shown before: see `layersOf`. */
+  show(change) {
+    this.#view = { ...this.#view, ...change };
+    this.#apply(layersOf(this.#view, colours()));
   }
 
-  /** Draws a cell of the shared map in place of what was drawn of it before. */
-  showCell(cell, collection) {
-    this.#show(cell.id, collection.features.map(({ geometry, properties, id }) => ({
-      type: "Feature",
-      geometry,
-      properties: { ...properties, sigma_m: properties.lateral_sigma_m, key: String(id), shared: true, local: false },
-    })));
+  /** Puts features into a source: "cells", "drive", "trace", "changes", "truth", "ruler" or "vehicles". */
+  put(source, features) {
+    this.map.getSource(source).setData({ type: "FeatureCollection", features });
   }
 
-  #show(id, features) {
-    const keys = new Set(features.map((feature) => feature.properties.key));
-    const remove = (this.#drawn.get(id)?.keys ?? []).filter((key) => !keys.has(key));
-    const metres = features.reduce((total, { geometry }) => total + lengthOf(geometry), 0);
-    this.#drawn.set(id, { keys: [...keys], metres });
-    this.#map.getSource("lanes").updateData({ remove, add: features });
+  /** Shows the map as it was at a revision, or as it is now. */
+  goTo(revision) {
+    if (revision === this.#revision) return;
+    this.#revision = revision;
+    this.reload();
   }
 
-  /** Removes what was drawn of a session. */
-  forget(id) {
-    this.#map.getSource("lanes").updateData({ remove: this.#drawn.get(id)?.keys ?? [] });
-    this.#drawn.delete(id);
+  /** Fetches all tiles again that are seen; what is drawn stays until they are there. */
+  reload() {
+    this.map.refreshTiles("lanes");
   }
 
-  showVehicles(sessions) {
-    const features = sessions.filter((session) => session.vehicle).map((session) => ({
-      type: "Feature",
-      geometry: { type: "Point", coordinates: vehiclePosition(session) },
-      properties: {
-        session: session.id,
-        local: !session.georeferenced,
-        heading: session.vehicle.heading_deg,
-        icon: `vehicle-${colourIndex(session)}`,
-        live: session.state === "live",
-      },
-    }));
-    this.#map.getSource("vehicles").setData({ type: "FeatureCollection", features });
+  /** Fetches those tiles again that are seen and touch one of some boxes. */
+  reloadWithin(boxes) {
+    const seen = this.#tilesWithin(boxes);
+    if (seen.length > 0) this.map.refreshTiles("lanes", seen);
+    return seen.length;
   }
 
-  /**
-   * Draws what the chosen session alone has seen in place of the shared map, which is drawn where none is chosen; of a
-   * `local` one the vehicle, too, is drawn alone, for it shares no frame with the others.
-   */
-  choose(id, local) {
-    if (this.#chosen === id && this.#local === local) return;
-    [this.#chosen, this.#local] = [id, local];
-    this.#restyle();
-  }
-
-  /** Flies to a box around sessions; whether they have one. */
-  look(sessions, durationMs) {
-    const box = boxOf(sessions);
+  /** Flies to a box; without one it stays, and says so. */
+  look(box, durationMs, maxZoom = 19) {
     if (!box) return false;
-    this.#map.fitBounds(box, { padding: this.#padding(), maxZoom: 19, duration: smooth(durationMs) });
+    this.map.fitBounds(box, { padding: this.padding(), maxZoom, duration: moving(durationMs) });
     return true;
   }
 
-  /** Whether a box around sessions lies wholly in the free part of the map. */
-  holds(sessions) {
-    const box = boxOf(sessions);
+  /** Whether a box lies wholly in the free part of the map. */
+  holds(box) {
     if (!box) return true;
-    const { clientWidth, clientHeight } = this.#map.getContainer();
-    const free = this.#padding();
-    return [[box[0], box[1]], [box[2], box[3]]].map((corner) => this.#map.project(corner)).every(({ x, y }) =>
+    const { clientWidth, clientHeight } = this.map.getContainer();
+    const free = this.padding();
+    return [[box[0], box[1]], [box[2], box[3]]].map((corner) => this.map.project(corner)).every(({ x, y }) =>
       x > free.left - 40 && x < clientWidth - 10 && y > 10 && y < clientHeight - free.bottom + 40);
   }
 
-  /** Whether a session's lanes can be seen: near enough, and within the view. */
-  sees(session) {
-    if (!session.bbox || this.#map.getZoom() < FARTHEST_ZOOM) return false;
-    const [west, south, east, north] = session.georeferenced ? session.bbox : placeLocalBox(session.bbox);
-    const view = this.#map.getBounds();
-    return west > east || (west <= view.getEast() && view.getWest() <= east
-      && south <= view.getNorth() && view.getSouth() <= north);
+  /** Whether a box `[west, south, east, north]` touches the view. */
+  sees([west, south, east, north]) {
+    const view = this.map.getBounds();
+    return west > east || (west <= view.getEast() && view.getWest() <= east && south <= view.getNorth() && view.getSouth() <= north);
   }
 
-  /** Keeps a session's vehicle in the middle of the free part of the map. */
-  centre(session) {
-    if (!session?.vehicle) return;
-    const zoom = Math.max(this.#map.getZoom(), 18);
-    const { top, right, bottom, left } = this.#padding();
+  /** Keeps a place in the middle of the free part of the map. */
+  centre(place, durationMs = 1000) {
+    const zoom = Math.max(this.map.getZoom(), 18);
+    const { top, right, bottom, left } = this.padding();
     const offset = [(left - right) / 2, (top - bottom) / 2];
-    this.#map.easeTo({ center: vehiclePosition(session), zoom, offset, duration: smooth(1000), easing: (part) => part });
+    this.map.easeTo({ center: place, zoom, offset, duration: moving(durationMs), easing: (part) => part });
   }
 
-  /** What is drawn: the length of all lines, metres, and the number of features on the screen. */
-  get state() {
-    const metres = [...this.#drawn.values()].reduce((total, session) => total + session.metres, 0);
-    return { metres, rendered: this.#onScreen().length };
+  /** A line at a pixel, or within a finger's breadth of it. */
+  lineAt({ x, y }) {
+    const around = [[x - REACH_PX, y - REACH_PX], [x + REACH_PX, y + REACH_PX]];
+    const paint = this.map.queryRenderedFeatures(around, { layers: this.#clickable() });
+    const named = paint.filter(({ properties }) => properties.lane);
+    return named.find(({ layer }) => layer.id !== "asphalt") ?? named[0];
   }
 
-  /** Resolves when the map stands still and all that it was given is on the screen. */
+  /** Resolves when the map stands still and all lines are on the screen; vehicles may move. */
   async settled() {
-    this.#map.triggerRepaint();
-    await this.#map.once("idle");
+    for (;;) {
+      this.map.triggerRepaint();
+      await this.map.once("render");
+      const loaded = ["lanes", "drive", "trace"].every((source) => this.map.isSourceLoaded(source));
+      if (loaded && !this.map.isMoving()) return;
+    }
   }
 
-  /** The sessions that have a line on the screen. */
-  sessionsOnScreen() {
-    return [...new Set(this.#onScreen().map((feature) => feature.properties.session).filter(Boolean))].sort();
+  /** The lines on the screen, by their feature ids; of the chosen drive where `own`. */
+  linesOnScreen(own = false) {
+    const layers = this.#clickable(own ? "drive-" : "");
+    const features = this.map.queryRenderedFeatures({ layers });
+    return [...new Set(features.map(({ id, properties }) => properties.lane_feature ?? id ?? `${properties.session}.${properties.lane}`))];
   }
 
-  /** A pixel on some line that no panel covers; waits for the map to stand still. */
+  /** A pixel on some line that nothing covers; waits for the map to stand still. */
   async somePointOfALine() {
     await this.settled();
-    const { left, right, top, bottom } = this.#padding();
-    const { clientWidth, clientHeight } = this.#map.getContainer();
+    const { left, right, top, bottom } = this.padding();
+    const { clientWidth, clientHeight } = this.map.getContainer();
     const free = [[left, top], [clientWidth - right, clientHeight - bottom]];
-    for (const { geometry } of this.#map.queryRenderedFeatures(free, { layers: CLICKABLE })) {
+    for (const { geometry, properties } of this.map.queryRenderedFeatures(free, { layers: this.#clickable() })) {
+      if (!properties.lane) continue;
       for (const place of geometry.type === "LineString" ? geometry.coordinates : geometry.coordinates.flat()) {
-        const { x, y } = this.#map.project(place);
+        const { x, y } = this.map.project(place);
         if (x > free[0][0] && x < free[1][0] && y > free[0][1] && y < free[1][1]) return [x, y];
       }
     }
     return undefined;
   }
 
-  #onScreen() {
-    return this.#map.queryRenderedFeatures({ layers: CLICKABLE });
+  /** Room for the panels: beside them on a desk, above them on a phone. */
+  padding() {
+    const box = (id) => document.getElementById(id).getBoundingClientRect();
+    const [panel, card, bar, banner] = [box("panel"), box("card"), box("bar"), box("banner")];
+    const { innerWidth, innerHeight } = window;
+    if (panel.width > innerWidth * 0.8) {
+      const top = Math.min(...[panel, card, bar].filter(({ height }) => height > 0).map((each) => each.top));
+      return { top: banner.bottom + 50, right: 30, bottom: Math.min(innerHeight - top + 20, innerHeight * 0.7), left: 30 };
+    }
+    return {
+      top: banner.bottom + 50, bottom: bar.height + 50,
+      left: panel.right + 40, right: card.width > 0 ? innerWidth - card.left + 30 : 60,
+    };
   }
 
-  /** Room for the panel, beside it on a desk and above it on a phone, and for the banner. */
-  #padding() {
-    const { width, height } = document.getElementById("panel").getBoundingClientRect();
-    const banner = document.getElementById("local-banner").getBoundingClientRect();
-    const phone = width > innerWidth * 0.8;
-    return { top: banner.bottom + 60, right: 60, bottom: phone ? height + 30 : 50, left: phone ? 40 : width + 50 };
+  #clickable(prefix = "") {
+    return this.#layers.map((layer) => layer.id).filter((id) => id.startsWith(prefix) && isClickable({ id: id.slice(prefix.length) }));
   }
 
-  #layers(colours) {
-    const ofChosen = ["==", ["get", "session"], this.#chosen ?? ""];
-    const shown = this.#chosen === undefined ? ["==", ["get", "shared"], true] : ofChosen;
-    return [
-      ...gridLayers(colours),
-      ...laneLayers(colours, this.#latitude, shown, this.#chosen ?? ""),
-      ...vehicleLayers(this.#local ? ofChosen : ["!", ["get", "local"]]),
-    ];
+  #tileRequest(url) {
+    const address = this.#revision === undefined ? url : `${url}?revision=${this.#revision}`;
+    return { url: address, headers: this.#server.headers() };
   }
 
-  #restyle() {
-    const colours = theme();
-    this.#map.setPaintProperty("ground", "background-color", colours.ground);
-    for (const layer of this.#layers(colours)) {
-      if (layer.filter) this.#map.setFilter(layer.id, layer.filter);
-      for (const [name, value] of Object.entries(layer.paint ?? {})) this.#map.setPaintProperty(layer.id, name, value);
+  /** The tiles on the screen that touch one of some boxes. */
+  #tilesWithin(boxes) {
+    const zoom = Math.min(Math.max(Math.floor(this.map.getZoom()), TILES_FROM), TILES_TO);
+    const { west, south, east, north } = edges(this.map.getBounds());
+    const found = new Map();
+    // Also those of the zooms around: a tilted map shows coarser ones far away, a zooming one still has others.
+    for (let z = Math.max(zoom - 4, TILES_FROM); z <= Math.min(zoom + 1, TILES_TO); z += 1) {
+      for (const box of boxes) {
+        const [x0, y0] = tileAt(Math.max(box[0], west), Math.min(box[3], north), z);
+        const [x1, y1] = tileAt(Math.min(box[2], east), Math.max(box[1], south), z);
+        for (let x = x0; x <= x1; x += 1) {
+          for (let y = y0; y <= y1; y += 1) found.set(`${z}/${x}/${y}`, { z, x, y });
+        }
+      }
+    }
+    return [...found.values()];
+  }
+
+  /** Changes the layers that differ from those that are there. */
+  #apply(wanted) {
+    if (!this.map.style?._loaded) return;
+    const before = new Map(this.#layers.map((layer) => [layer.id, layer]));
+    const ids = new Set(wanted.map(({ id }) => id));
+    for (const { id } of this.#layers) {
+      if (!ids.has(id)) this.map.removeLayer(id);
+    }
+    let above;
+    for (const layer of [...wanted].reverse()) {
+      const old = before.get(layer.id);
+      if (!old) this.map.addLayer(layer, above);
+      else this.#change(old, layer);
+      above = layer.id;
+    }
+    this.#layers = wanted;
+  }
+
+  #change(old, layer) {
+    if (differ(old.filter, layer.filter)) this.map.setFilter(layer.id, layer.filter ?? null);
+    for (const [name, value] of Object.entries(layer.paint ?? {})) {
+      if (differ(old.paint?.[name], value)) this.map.setPaintProperty(layer.id, name, value);
     }
   }
 
   #moved() {
-    const grid = this.#grid.cover(this.#map);
-    if (grid) this.#map.getSource("grid").setData(grid);
-    const latitude = this.#map.getCenter().lat;
-    if (Math.abs(latitude - this.#latitude) > 2) {
-      this.#latitude = latitude;
-      this.#restyle();
-    }
-  }
-
-  /** A line at a pixel, or within a finger's breadth of it. */
-  #lineAt({ x, y }) {
-    const around = [[x - REACH_PX, y - REACH_PX], [x + REACH_PX, y + REACH_PX]];
-    return this.#map.queryRenderedFeatures(around, { layers: CLICKABLE })[0];
-  }
-
-  #explain({ point, lngLat }) {
-    const properties = this.#lineAt(point)?.properties;
-    if (!properties) return;
-    const figures = {
-      ...(properties.shared ? { drives: properties.drives, cell: properties.cell } : { session: properties.session }),
-      existence: `${Math.round(properties.existence * 100)} %`,
-      "lateral sigma": `${Math.round(properties.sigma_m * 100)} cm`,
-      observations: properties.observations,
-      "last seen": properties.last_seen.replace("T", " ").slice(0, 19),
-    };
-    const title = document.createElement("h3");
-    const name = properties.shared ? "Line" : `Lane ${properties.lane}`;
-    title.textContent = `${name}: ${properties.category.replaceAll("_", " ")}`;
-    const table = document.createElement("table");
-    for (const [name, value] of Object.entries(figures)) {
-      const row = table.insertRow();
-      row.append(Object.assign(document.createElement("th"), { textContent: name }));
-      row.insertCell().textContent = value;
-    }
-    const content = document.createElement("div");
-    content.append(title, table);
-    new maplibre.Popup({ maxWidth: "320px", padding: this.#padding() }).setLngLat(lngLat).setDOMContent(content).addTo(this.#map);
+    const grid = this.#grid.cover(this.map);
+    if (grid) this.map.getSource("grid").setData(grid);
+    const latitude = this.map.getCenter().lat;
+    if (Math.abs(latitude - this.#view.latitude) > 2) this.show({ latitude });
   }
 }
 
-/** The smallest box around sessions that have one, in degrees. */
-function boxOf(sessions) {
-  return joinBoxes(sessions.filter((session) => session.bbox).map((session) =>
-    session.georeferenced ? session.bbox : placeLocalBox(session.bbox)));
+/** The smallest box around boxes that are there. */
+export function around(boxes) {
+  return joinBoxes(boxes.filter(Boolean));
 }
 
-/** A duration for those who like motion. */
-function smooth(durationMs) {
-  return matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : durationMs;
+function differ(one, other) {
+  return JSON.stringify(one) !== JSON.stringify(other);
 }
 
-function vehiclePosition(session) {
-  return session.georeferenced ? session.vehicle.position.slice(0, 2) : placeLocal(session.vehicle.position);
+function edges(bounds) {
+  return { west: bounds.getWest(), south: bounds.getSouth(), east: bounds.getEast(), north: bounds.getNorth() };
 }
 
-function vehicleLayers(shown) {
-  return [{
-    id: "vehicles",
-    type: "symbol",
-    source: "vehicles",
-    filter: shown,
-    layout: {
-      "icon-image": ["get", "icon"],
-      "icon-rotate": ["get", "heading"],
-      "icon-rotation-alignment": "map",
-      "icon-pitch-alignment": "map",
-      "icon-allow-overlap": true,
-      "icon-ignore-placement": true,
-      "icon-size": ["interpolate", ["linear"], ["zoom"], 12, 0.55, 18, 0.9, 22, 1.6],
-    },
-    paint: { "icon-opacity": ["case", ["get", "live"], 1, 0.45] },
-  }];
-}
-
-/** A vehicle seen from above: an arrowhead that points up, `colour` with a white rim and a soft shadow. */
-function arrow(colour) {
-  const size = 64;
-  const canvas = Object.assign(document.createElement("canvas"), { width: size, height: size });
-  const pen = canvas.getContext("2d");
-  pen.translate(size / 2, size / 2);
-  pen.beginPath();
-  for (const [x, y] of [[0, -24], [17, 20], [0, 11], [-17, 20]]) pen.lineTo(x, y);
-  pen.closePath();
-  pen.lineJoin = "round";
-  pen.shadowColor = "rgba(0, 0, 0, .55)";
-  pen.shadowBlur = 7;
-  pen.lineWidth = 7;
-  pen.strokeStyle = "#ffffff";
-  pen.stroke();
-  pen.shadowBlur = 0;
-  pen.fillStyle = colour;
-  pen.fill();
-  return pen.getImageData(0, 0, size, size);
+function tileAt(longitude, latitude, zoom) {
+  const most = 2 ** zoom;
+  const clamped = (Math.min(Math.max(latitude, -85), 85) * Math.PI) / 180;
+  const x = ((longitude + 180) / 360) * most;
+  const y = (0.5 - Math.asinh(Math.tan(clamped)) / (2 * Math.PI)) * most;
+  return [x, y].map((value) => Math.min(Math.max(Math.floor(value), 0), most - 1));
 }

@@ -1,107 +1,160 @@
-// The panel: the state of the connection, the sessions, the legend.
+// The panel: the state of the connection, totals, layers with their legend, and drives.
 
+import { MEASURES, measure } from "./measures.js";
 import { LEGEND, swatch } from "./paint.js";
+import { colours } from "./theme.js";
+import { colourOf } from "./vehicles.js";
 
-/** Colours by which sessions are told apart: vehicles on the map and dots in the list. */
-export const SESSION_COLOURS = [
-  "#2f9bff", "#ff7a45", "#3ecf8e", "#e255c5", "#a78bfa", "#18c5d9", "#f25f5c", "#8fbf26", "#f2b632", "#b98a5e",
+/** The choices of a layer, in the order of their keys 1, 2, 3, ... */
+export const LAYERS = [
+  { id: "paint", name: "Paint", says: "Each line as it is painted on the road" },
+  ...MEASURES,
+  { id: "change", name: "Change", says: "What came, moved or went" },
 ];
 
-/** The colour's index of a session that has its number. */
-export function colourIndex(session) {
-  return session.number % SESSION_COLOURS.length;
-}
-
+/** Drives in the list at most; more are counted. */
+const MOST_DRIVES = 60;
+const CONNECTION = { connecting: "connecting", connected: "connected", lost: "no connection", locked: "locked", past: "in the past" };
 const element = (id) => document.getElementById(id);
 
 export class Panel {
   #rows = new Map();
   #chosen;
+  #on;
+  #legend;
 
-  /** `on.choose(id)`, `on.overview()` and `on.follow()` are called as their buttons and keys are pressed. */
+  /** `on.layer(id)`, `on.drive(id)` and `on.overview()` are called as they are chosen. */
   constructor(on) {
-    this.on = on;
+    this.#on = on;
+    const choices = LAYERS.map(({ id, name }, index) => {
+      const label = document.createElement("label");
+      label.title = `${name} (${index + 1})`;
+      label.innerHTML = `<input type="radio" name="layer"><span></span>`;
+      Object.assign(label.firstChild, { value: id, checked: id === "paint" });
+      label.lastChild.textContent = name;
+      return label;
+    });
+    element("layers").querySelector(".choices").replaceChildren(...choices);
+    element("layers").addEventListener("change", ({ target }) => on.layer(target.value));
     element("overview").addEventListener("click", on.overview);
-    element("follow").addEventListener("click", on.follow);
-    element("fold").addEventListener("click", () => this.fold());
-    document.addEventListener("keydown", (event) => this.#key(event));
-    if (matchMedia("(max-width: 699px)").matches) element("legend-box").open = false;
   }
 
   connection(state) {
-    const pill = element("connection");
-    pill.dataset.state = state;
-    pill.textContent = state === "lost" ? "no connection" : state;
+    element("connection").dataset.state = state;
+    element("connection").textContent = CONNECTION[state];
   }
 
-  /** Shows the newest of `count` sessions as the server listed them, the newest first. */
-  sessions(list, count) {
-    const sum = (field) => list.reduce((total, session) => total + session[field], 0);
-    const live = list.filter((session) => session.state === "live").length;
-    const totals = { live, sessions: count, lanes: sum("lanes"), frames: sum("frames") };
-    for (const [name, value] of Object.entries(totals)) {
-      document.querySelector(`[data-total="${name}"]`).textContent = short(value);
-    }
-    element("no-sessions").hidden = list.length > 0;
-    const alive = new Set(list.map((session) => session.id));
+  /** Shows the totals that are given: kilometres of line, drives, those live, the typical sigma in metres. */
+  totals({ km, drives, live, sigma_m }) {
+    const show = (name, value) => value !== undefined && element("panel").querySelector(`[data-total="${name}"]`).replaceChildren(...value);
+    const unit = (text) => Object.assign(document.createElement("small"), { textContent: text });
+    show("km", km === undefined ? undefined : [km < 100 ? km.toFixed(1) : short(km), unit("km")]);
+    show("drives", drives === undefined ? undefined : [short(drives)]);
+    show("live", live === undefined ? undefined : [short(live)]);
+    show("sigma", sigma_m === undefined ? undefined : Number.isFinite(sigma_m) ? [`${Math.round(sigma_m * 100)}`, unit("cm")] : ["–"]);
+  }
+
+  /** Marks the chosen layer, and explains it. */
+  layer(id) {
+    const input = element("layers").querySelector(`input[value="${id}"]`);
+    if (input) input.checked = true;
+    this.says(LAYERS.find((each) => each.id === id)?.says ?? "");
+    this.#legend = id;
+    this.recolour();
+  }
+
+  /** Says what the chosen layer shows. */
+  says(text) {
+    if (element("layer-says").textContent !== text) element("layer-says").textContent = text;
+  }
+
+  /** Draws the legend anew, in the colours of the theme. */
+  recolour() {
+    const by = measure(this.#legend);
+    element("legend").replaceChildren(by ? ramp(by) : this.#legend === "change" ? changes() : paints());
+  }
+
+  /** Shows drives, the newest first; `total` counts those of the store. */
+  drives(list, total) {
+    const shown = list.slice(0, MOST_DRIVES);
+    const alive = new Set(shown.map(({ id }) => id));
     for (const [id, row] of this.#rows) {
       if (!alive.has(id)) this.#rows.delete(id), row.remove();
     }
-    for (const session of list.toReversed()) this.#row(session);
+    shown.forEach((drive, index) => this.#row(drive, index));
+    element("more-drives").hidden = total <= shown.length;
+    element("more-drives").textContent = `and ${short(total - shown.length)} older ones, at /sessions`;
+    element("drives-box").hidden = total === 0;
   }
 
-  /** Marks a session, or none, as the chosen one. */
-  choose(id, { local, following }) {
+  /** Marks a drive, or none, as the chosen one. */
+  choose(id) {
     this.#chosen = id;
     for (const [each, row] of this.#rows) row.firstChild.setAttribute("aria-current", String(each === id));
-    element("local-banner").hidden = !local;
-    element("follow").disabled = id === undefined;
-    element("follow").setAttribute("aria-pressed", String(following));
   }
 
-  legend(colours) {
-    const items = LEGEND.map(({ name, category }) => {
-      const item = document.createElement("li");
-      item.innerHTML = swatch(category, colours);
-      item.append(name);
-      return item;
-    });
-    element("legend").replaceChildren(...items);
-  }
-
-  fold() {
-    const folded = element("panel").classList.toggle("folded");
-    element("fold").setAttribute("aria-expanded", String(!folded));
-  }
-
-  #row(session) {
-    let row = this.#rows.get(session.id);
+  #row(drive, index) {
+    let row = this.#rows.get(drive.id);
     if (!row) {
       row = document.createElement("li");
-      row.innerHTML = `<button type="button"><span class="dot"></span><span class="name"><span></span> <code></code></span><span class="state"></span><span class="figures"></span></button>`;
-      row.style.setProperty("--session", SESSION_COLOURS[colourIndex(session)]);
-      row.querySelector("code").textContent = session.id;
-      row.firstChild.title = `Fly to ${session.id}`;
-      row.firstChild.setAttribute("aria-current", String(session.id === this.#chosen));
-      row.firstChild.addEventListener("click", () => this.on.choose(session.id));
-      this.#rows.set(session.id, row);
-      element("sessions").prepend(row);
+      row.innerHTML = `<button type="button" class="choose"><span class="dot"></span><span class="name"></span><span class="state"></span><span class="figures"></span></button>`;
+      row.style.setProperty("--drive", colourOf(drive.id));
+      row.dataset.drive = drive.id;
+      row.firstChild.title = `Drive ${drive.id}: what it alone saw, to replay`;
+      row.firstChild.setAttribute("aria-current", String(drive.id === this.#chosen));
+      row.firstChild.addEventListener("click", () => this.#on.drive(drive.id === this.#chosen ? undefined : drive.id));
+      this.#rows.set(drive.id, row);
     }
-    row.querySelector(".name span").textContent = `Drive ${session.number}`;
-    const state = row.querySelector(".state");
-    state.textContent = state.dataset.state = session.state;
-    const where = session.georeferenced ? "" : " · own frame";
-    row.querySelector(".figures").textContent = `${short(session.lanes)} lanes · ${short(session.frames)} frames${where}`;
-  }
-
-  #key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.key === "Escape") this.on.overview();
-    else if (event.key === "f" || event.key === "F") this.on.follow();
-    else if (event.key === "p" || event.key === "P") this.fold();
+    const at = element("drives").children[index];
+    if (at !== row) element("drives").insertBefore(row, at ?? null);
+    const say = (name, text) => {
+      const cell = row.querySelector(`.${name}`);
+      if (cell.textContent !== text) cell.textContent = text;
+    };
+    say("name", `Drive ${drive.number}`);
+    say("state", drive.state);
+    row.querySelector(".state").dataset.state = drive.state;
+    const place = { "own frame": " · own frame, no GNSS", "kept apart": " · kept apart" }[drive.placement] ?? "";
+    say("figures", `${short(drive.lanes)} lanes · ${short(drive.frames)} frames${place}`);
   }
 }
 
-function short(count) {
-  return count < 10000 ? String(count) : Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 }).format(count);
+function paints() {
+  const theme = colours();
+  const list = document.createElement("ul");
+  list.append(...LEGEND.map(({ name, category }) => {
+    const item = document.createElement("li");
+    item.innerHTML = swatch(category, theme);
+    item.append(name);
+    return item;
+  }));
+  return list;
+}
+
+function changes() {
+  const list = document.createElement("ul");
+  const kinds = [["appeared", "appeared"], ["moved", "moved"], ["vanished", "vanished, dashed"]];
+  list.append(...kinds.map(([kind, name]) => {
+    const item = document.createElement("li");
+    item.innerHTML = `<span class="dash-swatch"></span>`;
+    item.firstChild.style.borderColor = `var(--${kind})`;
+    if (kind === "vanished") item.firstChild.dataset.dashed = "";
+    item.append(name);
+    return item;
+  }));
+  return list;
+}
+
+function ramp(by) {
+  const box = document.createElement("div");
+  box.innerHTML = `<div class="ramp" role="img"></div><div class="ramp-labels"></div>`;
+  box.firstChild.style.background = `linear-gradient(to right, ${by.colours.join(", ")})`;
+  box.firstChild.setAttribute("aria-label", `Scale from ${by.labels[0]} to ${by.labels.at(-1)}`);
+  box.lastChild.append(...by.labels.map((text) => Object.assign(document.createElement("span"), { textContent: text })));
+  return box;
+}
+
+/** A count as it fits into little room. */
+export function short(count) {
+  return count < 10000 ? String(Math.round(count)) : Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 }).format(count);
 }

@@ -1,7 +1,7 @@
 //! The lanemap viewer: a page and its scripts, embedded at build time.
 //!
-//! The page polls `/sessions` of the server that served it, draws what changed with MapLibre, and asks nothing of any
-//! other host. Its files stand in `page/`; MapLibre comes from npm while the crate is built (see `build.rs`).
+//! The page asks the server that served it what changed, draws its vector tiles with MapLibre, and asks nothing of any other
+//! host. Its files stand in `page/`; MapLibre and the typeface come from npm while the crate is built (see `build.rs`).
 //!
 //! ```
 //! let page = lanemap_web::asset("index.html").unwrap();
@@ -41,6 +41,10 @@ pub fn has_map() -> bool {
 mod tests {
     use super::*;
 
+    fn is_own(name: &str) -> bool {
+        !name.starts_with("maplibre-gl") && !name.starts_with("inter")
+    }
+
     #[test]
     fn every_asset_is_found_by_its_name_and_is_not_empty() {
         for expected in ASSETS {
@@ -53,7 +57,7 @@ mod tests {
 
     #[test]
     fn the_page_names_no_other_host() {
-        for asset in ASSETS.iter().filter(|asset| !asset.name.starts_with("maplibre-gl")) {
+        for asset in ASSETS.iter().filter(|asset| is_own(asset.name)) {
             let text = std::str::from_utf8(asset.bytes).unwrap().replace("http://www.w3.org/2000/svg", "");
             assert!(!text.contains("http://") && !text.contains("https://"), "{} names a host", asset.name);
         }
@@ -61,10 +65,8 @@ mod tests {
 
     #[test]
     fn every_module_that_a_page_file_imports_is_embedded() {
-        let of_maplibre = |name: &str| name.starts_with("maplibre-gl");
-        for asset_file in
-            ASSETS.iter().filter(|asset| asset.content_type.starts_with("text/javascript") && !of_maplibre(asset.name))
-        {
+        let is_script = |asset: &&Asset| asset.content_type.starts_with("text/javascript") && is_own(asset.name);
+        for asset_file in ASSETS.iter().filter(is_script) {
             let text = std::str::from_utf8(asset_file.bytes).unwrap();
             for line in text.lines().filter(|line| line.starts_with("import ")) {
                 let name = line.split('"').nth(1).unwrap().trim_start_matches("./");

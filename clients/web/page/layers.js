@@ -1,0 +1,149 @@
+// All that is drawn, from the ground up: which layers there are for what the page is to show.
+
+import { gridLayers } from "./grid.js";
+import { measure, measureLayer } from "./measures.js";
+import { groundWidth, paintLayers, roadLayers } from "./paint.js";
+
+/** First zoom of vector tiles: farther out, the cells of the map are drawn as squares. */
+export const TILES_FROM = 12;
+/** First zoom at which tiles tell what is known along a line. */
+const STRETCHES_FROM = 15;
+
+const SHARED = { source: "lanes", sourceLayer: "lanes" };
+const NONE = ["==", ["literal", 1], 0];
+
+/**
+ * The layers, bottom first. `view` is what the page shows: `layer` ("paint", "change" or a measure), `lane` (the name of the
+ * chosen line), `drive` (`{ local }` of the chosen drive), `latitude`, `nowS`.
+ */
+export function layersOf(view, colours) {
+  const { latitude } = view;
+  const alone = view.drive !== undefined;
+  const shared = view.drive?.local ? NONE : undefined;
+  const road = { ...SHARED, shown: shared, latitude, colours };
+  const by = measure(view.layer);
+  const muted = alone || view.layer === "change";
+  return [
+    { id: "ground", type: "background", paint: { "background-color": colours.ground } },
+    ...gridLayers(colours),
+    ...cellLayers(colours, shared),
+    ...roadLayers(road),
+    ...(alone ? roadLayers({ prefix: "drive-", source: "drive", latitude, colours: { ...colours, ribbon: colours.accent } }) : []),
+    chosenLayer(view, colours),
+    ...(by && !alone ? measureLayers(by, view, shared) : paintLayers({ ...road, strength: muted ? 0.25 : 1 })),
+    ...(view.layer === "change" && !alone ? changeLayers(colours, latitude) : []),
+    ...(alone ? [
+      ...paintLayers({ prefix: "drive-", source: "drive", latitude, colours }),
+      traceLayer(colours),
+    ] : []),
+    truthLayer(colours, latitude),
+    ...rulerLayers(colours),
+    ...vehicleLayers(colours, view.drive),
+  ];
+}
+
+/** The layers that answer a click, of those that are drawn. */
+export const isClickable = ({ id }) => /^(curb|unknown|solid|dashed|double|mixed|measure|change|asphalt)/.test(id);
+
+function measureLayers(by, view, shown) {
+  const layer = (id, sourceLayer, zooms) => ({
+    ...measureLayer({ source: "lanes", sourceLayer, shown, latitude: view.latitude, by, nowS: view.nowS }), id, ...zooms,
+  });
+  return [
+    layer("measure-far", "lanes", { maxzoom: STRETCHES_FROM }),
+    layer("measure", "stretches", { minzoom: STRETCHES_FROM }),
+  ];
+}
+
+function cellLayers(colours, shown) {
+  const cells = { source: "cells", maxzoom: TILES_FROM + 0.5, ...(shown ? { filter: shown } : {}) };
+  const fading = ["interpolate", ["linear"], ["zoom"], TILES_FROM - 0.5, 1, TILES_FROM + 0.5, 0];
+  return [
+    { id: "cells", type: "fill", ...cells, paint: { "fill-color": colours.ribbon, "fill-opacity": fading } },
+    { id: "cells-edge", type: "line", ...cells, paint: { "line-color": colours.ground, "line-width": 1, "line-opacity": fading } },
+  ];
+}
+
+function chosenLayer(view, colours) {
+  return {
+    id: "chosen",
+    type: "line",
+    source: "lanes",
+    "source-layer": "lanes",
+    minzoom: 14,
+    filter: view.lane === undefined ? NONE : ["==", ["get", "lane"], view.lane],
+    layout: { "line-join": "round", "line-cap": "round" },
+    paint: { "line-color": colours.chosen, "line-opacity": 0.75, "line-width": groundWidth(1.3, 7, view.latitude) },
+  };
+}
+
+function changeLayers(colours, latitude) {
+  const kind = ["get", "kind"];
+  const colour = ["match", kind, "vanished", colours.vanished, "moved", colours.moved, colours.appeared];
+  const line = (id, filter, paint) => ({
+    id, type: "line", source: "changes", filter,
+    layout: { "line-join": "round", "line-cap": "butt" },
+    paint: { "line-color": colour, "line-width": groundWidth(0.6, 2.6, latitude), ...paint },
+  });
+  return [
+    line("change", ["!=", kind, "vanished"], {}),
+    line("change-gone", ["==", kind, "vanished"], { "line-dasharray": [2, 1.4] }),
+  ];
+}
+
+function traceLayer(colours) {
+  return {
+    id: "trace", type: "line", source: "trace",
+    layout: { "line-join": "round", "line-cap": "round" },
+    paint: { "line-color": colours.accent, "line-width": 2.5, "line-opacity": 0.9, "line-dasharray": [0.2, 2] },
+  };
+}
+
+function truthLayer(colours, latitude) {
+  return {
+    id: "truth", type: "line", source: "truth",
+    layout: { "line-join": "round" },
+    paint: { "line-color": colours.truth, "line-width": groundWidth(0.06, 1.4, latitude), "line-opacity": 0.95 },
+  };
+}
+
+function rulerLayers(colours) {
+  return [
+    {
+      id: "ruler", type: "line", source: "ruler", filter: ["==", ["geometry-type"], "LineString"],
+      paint: { "line-color": colours.accent, "line-width": 2, "line-dasharray": [2, 1.5] },
+    },
+    {
+      id: "ruler-ends", type: "circle", source: "ruler", filter: ["==", ["geometry-type"], "Point"],
+      paint: {
+        "circle-radius": 4.5, "circle-color": colours.card, "circle-stroke-color": colours.accent, "circle-stroke-width": 2.5,
+      },
+    },
+  ];
+}
+
+function vehicleLayers(colours, drive) {
+  const chosen = ["==", ["get", "chosen"], true];
+  return [
+    {
+      id: "vehicle-halo", type: "circle", source: "vehicles", filter: chosen,
+      paint: {
+        "circle-radius": 19, "circle-color": colours.accent, "circle-opacity": 0.22,
+        "circle-stroke-color": colours.accent, "circle-stroke-width": 1.5,
+      },
+    },
+    {
+      id: "vehicles", type: "symbol", source: "vehicles",
+      ...(drive ? { filter: chosen } : {}),
+      layout: {
+        "icon-image": ["get", "icon"],
+        "icon-rotate": ["get", "heading"],
+        "icon-rotation-alignment": "map",
+        "icon-pitch-alignment": "map",
+        "icon-allow-overlap": true,
+        "icon-ignore-placement": true,
+        "icon-size": ["interpolate", ["linear"], ["zoom"], 12, 0.5, 18, 0.85, 22, 1.6],
+      },
+    },
+  ];
+}

@@ -1,0 +1,51 @@
+// How the page looks, and whether everybody can use it: axe finds nothing serious, in any of its states.
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { after, before, test } from "node:test";
+import { DESK, PHONE, launch, open, picture, untilDrawn } from "./stage.mjs";
+
+const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+
+let browser;
+before(async () => (browser = await launch()));
+after(() => browser.close());
+
+/** What axe finds on the page as it is, of what keeps people out. */
+async function found(page) {
+  await page.evaluate(axe);
+  const { violations } = await page.evaluate(() => window.axe.run(document, { resultTypes: ["violations"] }));
+  const grave = violations.filter(({ impact }) => ["serious", "critical"].includes(impact));
+  return grave.flatMap(({ id, nodes }) => nodes.map(({ target, failureSummary }) => `${id} at ${target}: ${failureSummary}`));
+}
+
+for (const [device, options] of [["desk", DESK], ["phone", PHONE]]) {
+  for (const colorScheme of ["light", "dark"]) {
+    test(`axe finds nothing serious on a ${device} in the ${colorScheme}`, async () => {
+      const { page, close } = await open(browser, { ...options, colorScheme, reducedMotion: "reduce" });
+      await untilDrawn(page);
+      const where = `${device}-${colorScheme}`;
+      assert.deepEqual(await found(page), [], "the map");
+      if (device === "phone") await page.locator("#grip").click();
+      for (const layer of ["sigma", "change", "paint"]) {
+        await page.locator(`#layers input[value="${layer}"]`).check({ force: true });
+        assert.deepEqual(await found(page), [], `layer ${layer}`);
+      }
+      if (device === "phone") await page.locator("#grip").click({ clickCount: 2 });
+      await page.evaluate(async () => {
+        const { map } = window.lanemap;
+        const [x, y] = await map.somePointOfALine();
+        map.map.fire("click", { point: { x, y }, lngLat: map.map.unproject([x, y]) });
+      });
+      await page.locator("#card").waitFor();
+      assert.deepEqual(await found(page), [], "a line's card");
+      await picture(page, `card-${where}`);
+      await page.keyboard.press("?");
+      await page.locator("#help").waitFor();
+      assert.deepEqual(await found(page), [], "the keys");
+      await page.screenshot({ path: `${process.env.SCREENSHOTS}/help-${where}.png` });
+      await close();
+    });
+  }
+}

@@ -12,6 +12,7 @@ pub mod auth;
 pub mod change_feed;
 pub mod config;
 pub mod error;
+pub mod export;
 pub mod fuse;
 #[doc(hidden)]
 pub mod fuzzing;

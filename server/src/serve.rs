@@ -19,6 +19,7 @@
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
 //! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
+//! | `/exports/{id}` | a cell for other programs: GeoJSON, FlatGeobuf, PMTiles, Lanelet2, OpenDRIVE; `format`, or a suffix |
 //! | `/splines/{z}/{x}/{y}` | the lines that touch a tile, as splines, protobuf `lanemap.v1.SplineTile` |
 //! | `/viewer` | a page that draws them |
 //! | `/healthz`, `/readyz`, `/metrics` | for operators |
@@ -32,9 +33,10 @@ mod difference;
 mod drive_items;
 mod encoding;
 pub mod entity_tag;
+mod exports;
 pub mod extents;
 pub mod features;
-mod items;
+pub(crate) mod items;
 mod lane_history;
 mod limits;
 pub mod line;
@@ -47,7 +49,7 @@ mod query;
 pub(crate) mod sample;
 mod session_trace;
 mod sessions;
-mod shared_lanes;
+pub(crate) mod shared_lanes;
 mod splines;
 mod tile_cache;
 mod tiles;
@@ -170,6 +172,7 @@ pub fn router(state: ServeState) -> Router {
         .route("/cells/{id}/changes", get(cells::changes_json))
         .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
         .route("/changes", get(changes::changes))
+        .route("/exports/{id}", get(exports::cell))
         .route("/splines/{z}/{x}/{y}", get(splines::tile))
         .route(tiles::PATH, get(tiles::tile_json))
         .route("/tiles/lanes/{z}/{x}/{y}", get(tiles::tile))

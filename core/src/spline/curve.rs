@@ -212,6 +212,12 @@ pub struct Segment {
 }
 
 impl Segment {
+    /// The polynomial: `c0 + c1 u + c2 u^2 + c3 u^3`, with `u` from 0 at the segment's start to 1 at its end.
+    #[must_use]
+    pub fn coefficients(&self) -> &[Vector3<f64>; 4] {
+        &self.coefficients
+    }
+
     /// Whether a parameter lies on this segment.
     #[must_use]
     pub fn holds(&self, parameter: f64) -> bool {

@@ -242,7 +242,7 @@ fn known(map: &SharedMap, id: &str) -> Result<(CellId, Arc<CellRecord>), Problem
 }
 
 /// The newest version of a cell, read beside the runtime.
-async fn published(map: &SharedMap, id: &str) -> Result<(CellId, Arc<PublishedCell>), Problem> {
+pub(super) async fn published(map: &SharedMap, id: &str) -> Result<(CellId, Arc<PublishedCell>), Problem> {
     let (cell, _) = known(map, id)?;
     let map = map.clone();
     let found = in_background(move || map.get(cell)).await??;

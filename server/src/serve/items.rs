@@ -64,7 +64,7 @@ impl PageQuery<Cursor> {
 }
 
 /// The borders of a cell.
-pub(super) fn of_cell(cell: CellId) -> Bounds {
+pub(crate) fn of_cell(cell: CellId) -> Bounds {
     let bounds = cell.bounds();
     Bounds { west: bounds.west, south: bounds.south, east: bounds.east, north: bounds.north, heights: None }
 }

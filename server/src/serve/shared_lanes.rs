@@ -9,6 +9,7 @@ use lanemap_proto::v1;
 use serde::Serialize;
 
 use super::{
+    bounds::Bounds,
     features::{LaneGeometry, category_name, on_the_earth, rfc3339},
     line::{Coordinate, drawn_through, rounded, written},
 };
@@ -17,16 +18,16 @@ use crate::fuse::wire::positions;
 /// One line within one cell, with what is known of it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "type", rename = "Feature")]
-pub(super) struct SharedLane {
+pub(crate) struct SharedLane {
     /// Cell, line and part, joined by dots: unique over all cells.
-    pub(super) id: String,
-    pub(super) geometry: LaneGeometry,
-    properties: SharedLaneProperties,
+    pub(crate) id: String,
+    pub(crate) geometry: LaneGeometry,
+    pub(crate) properties: SharedLaneProperties,
 }
 
 /// What is known of a line.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-struct SharedLaneProperties {
+pub(crate) struct SharedLaneProperties {
     /// Name of the line: the same in every cell and every version, as long as its oldest witness is.
     lane: String,
     /// The cell that it is cut to.
@@ -82,13 +83,19 @@ pub(super) fn cell_lanes(cell: CellId, map: &v1::CellMap) -> CellLanes {
 }
 
 /// One line of a cell as a feature; `None` where it draws nothing.
-pub(super) fn shared_lane(anchor: &Anchor, map: &v1::CellMap, lane: &v1::FusedLane) -> Option<SharedLane> {
+pub(crate) fn shared_lane(anchor: &Anchor, map: &v1::CellMap, lane: &v1::FusedLane) -> Option<SharedLane> {
     let coordinates = coordinates(anchor, lane);
     if coordinates.len() < 2 {
         return None;
     }
     let geometry = on_the_earth(coordinates);
     Some(SharedLane { id: feature_id(&map.cell, &lane.id, lane.part), geometry, properties: properties(map, lane) })
+}
+
+/// Whether a line of a cell enters a box.
+pub(crate) fn enters(cell: CellId, lane: &v1::FusedLane, bounds: &Bounds) -> bool {
+    let line = coordinates(&cell.anchor(), lane);
+    line.len() > 1 && on_the_earth(line).enters(bounds)
 }
 
 /// The feature id of a piece of a line.

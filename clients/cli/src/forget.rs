@@ -1,10 +1,12 @@
 //! `lanemap forget`: has a service delete what it has of a vehicle, or of one drive.
 
-use std::{path::PathBuf, process::ExitCode};
+use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use lanemap_client::{AdminClient, ConnectOptions, Credentials, IdentityFiles, Token};
+use lanemap_client::{AdminClient, ConnectOptions};
+
+use crate::credentials::CredentialArgs;
 
 /// Whom to forget, and where.
 #[derive(Args, Debug)]
@@ -21,36 +23,15 @@ pub struct ForgetArgs {
     /// One drive of the vehicle; without it, all of them
     #[arg(long, value_name = "ID")]
     drive: Option<String>,
-    /// File of a bearer token of scope admin
-    #[arg(long, value_name = "FILE")]
-    token_file: Option<PathBuf>,
-    /// Certificates that sign the service's, PEM, for an address that begins with https
-    #[arg(long, value_name = "FILE")]
-    ca: Option<PathBuf>,
-    /// The operator's own certificate, PEM, for a service that asks for one
-    #[arg(long, value_name = "FILE", requires = "key")]
-    cert: Option<PathBuf>,
-    /// Its private key, PEM
-    #[arg(long, value_name = "FILE", requires = "cert")]
-    key: Option<PathBuf>,
-}
-
-impl ForgetArgs {
-    fn credentials(&self) -> Credentials {
-        let identity = self.cert.clone().zip(self.key.clone());
-        Credentials {
-            ca: self.ca.clone(),
-            identity: identity.map(|(cert, key)| IdentityFiles { cert, key }),
-            token: self.token_file.clone().map(Token::File),
-            ..Credentials::default()
-        }
-    }
+    /// Who asks; a token must have the scope admin
+    #[command(flatten)]
+    credentials: CredentialArgs,
 }
 
 /// Asks for the deletion and waits until the data are gone from the disk.
 #[tokio::main]
 pub async fn run(args: &ForgetArgs) -> anyhow::Result<ExitCode> {
-    let options = ConnectOptions { credentials: args.credentials(), ..ConnectOptions::default() };
+    let options = ConnectOptions { credentials: args.credentials.read(), ..ConnectOptions::default() };
     let client = AdminClient::connect(&args.server, &options).await;
     let client = client.with_context(|| format!("{} cannot be reached", args.server))?;
     let drives = client.forget(&args.fleet, &args.vehicle, args.drive.as_deref()).await;

@@ -1,4 +1,4 @@
-//! The `lanemap` command: serve, replay, record, evaluate, bench, simulate, demo, zenoh-access.
+//! The `lanemap` command: serve, replay, record, export, evaluate, bench, simulate, demo, zenoh-access.
 //!
 //! Results go to stdout; logs, progress and errors to stderr. The exit code is 0 only where everything was done:
 //! 1 where something failed (the message says what, and what to do), 2 where the command line is wrong.
@@ -8,8 +8,10 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 mod bench;
+mod credentials;
 mod demo;
 mod evaluate;
+mod export;
 mod forget;
 mod logging;
 mod record;
@@ -36,6 +38,8 @@ enum Command {
     Replay(Box<replay::ReplayArgs>),
     /// Records drives as MCAP, which Foxglove opens: OpenLane folders, ROS 1 bags, or MCAP again.
     Record(Box<record::RecordArgs>),
+    /// Writes the shared map for other programs: GeoJSON, FlatGeobuf, PMTiles, Lanelet2, OpenDRIVE.
+    Export(export::ExportArgs),
     /// Measures maps, poses and associations as the paper's tables do.
     Evaluate(evaluate::EvaluateArgs),
     /// Deletes what a service has of a vehicle, or of one drive, and waits until it is gone.
@@ -61,6 +65,7 @@ pub fn run() -> ExitCode {
         Command::Serve(args) => serve::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Record(args) => record::run(&args),
+        Command::Export(args) => export::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Forget(args) => forget::run(&args),

@@ -1,4 +1,6 @@
-//! Reads maps over HTTP.
+//! Reads maps over HTTP: those of drives, and the cells of the shared one.
+
+mod cells;
 
 use std::{sync::Arc, time::Duration};
 

@@ -55,6 +55,7 @@ pub mod change;
 pub mod contribution;
 pub mod correction;
 pub mod fusion;
+mod georeferenced;
 mod growth;
 pub mod line;
 pub mod matching;

@@ -35,7 +35,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 5;
+const SNAPSHOT_VERSION: u16 = 6;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -49,6 +49,8 @@ pub struct Mapper {
     time: TimestampNs,
     /// Frames taken.
     frames: u64,
+    /// Way of the vehicle by odometry, metres.
+    way_m: f64,
     lanes: BTreeMap<LaneId, Landmark>,
     index: LaneIndex,
     last_lane: u64,
@@ -98,6 +100,7 @@ impl Mapper {
             odometry_from_vehicle: None,
             time: TimestampNs(0),
             frames: 0,
+            way_m: 0.0,
             lanes: BTreeMap::new(),
             index: LaneIndex::default(),
             last_lane: 0,
@@ -128,6 +131,13 @@ impl Mapper {
         let seconds = frame.time().seconds_since(self.time);
         self.time = frame.time();
         self.frames += 1;
+        if let Some(previous) = &previous {
+            self.way_m += nalgebra::distance(
+                &previous.translation.vector.into(),
+                &odometry.odometry_from_vehicle.translation.vector.into(),
+            );
+            self.index.forget_touched_before(self.way_m - self.params.landmark.left_behind_m);
+        }
         match previous {
             Some(previous) => self.pose.predict(&previous, odometry, seconds, &self.params.tracking),
             None => PoseEstimate::first(odometry.odometry_from_vehicle),
@@ -221,7 +231,7 @@ impl Mapper {
         let near = scene::near_knots(lane, run);
         Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, near, &self.sensor, &self.params);
         self.seen_now.push(run.lane);
-        self.index.update(run.lane, lane.information(), near.0, near.1);
+        self.index.update(run.lane, lane.information(), near.0, near.1, self.way_m);
         grown
     }
 
@@ -234,7 +244,7 @@ impl Mapper {
         self.last_lane += 1;
         let all = lane.knots();
         Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, all, &self.sensor, &self.params);
-        self.index.update(id, lane.information(), all.0, all.1);
+        self.index.update(id, lane.information(), all.0, all.1, self.way_m);
         self.lanes.insert(id, lane);
         self.seen_now.push(id);
         Some(id)
@@ -257,6 +267,7 @@ impl Mapper {
         lane.vote_extent(observation, map_from_vehicle, near, visibility, &params.landmark);
         lane.category.vote(observation.category);
         lane.existence.seen(DETECTION);
+        lane.missed = 0;
         lane.observations += 1;
         lane.last_seen = time;
     }
@@ -276,11 +287,13 @@ impl Mapper {
             let chance =
                 scene::detection_probability(lane, run, &self.pose.map_from_vehicle, &self.sensor, &self.params);
             lane.existence.missed(chance);
+            lane.missed += 1;
             if lane.existence.is_given_up() {
-                dropped.push(run.lane);
+                dropped.push(*run);
             }
         }
-        dropped.retain(|id| !self.retire(*id));
+        dropped.retain(|run| !self.retire(run));
+        let dropped: Vec<LaneId> = dropped.iter().map(|run| run.lane).collect();
         for id in &dropped {
             self.forget(*id);
         }
@@ -288,14 +301,19 @@ impl Mapper {
     }
 
     /// Keeps a lane that is given up for the stretch that was there; whether there was one.
-    fn retire(&mut self, id: LaneId) -> bool {
+    fn retire(&mut self, run: &NearbyRun) -> bool {
         let least = self.params.landmark.published_existence;
-        let Some(lane) = self.lanes.get_mut(&id).filter(|lane| lane.existence.greatest_probability() > least) else {
+        let Some(lane) = self.lanes.get_mut(&run.lane).filter(|lane| lane.existence.greatest_probability() > least)
+        else {
             return false;
         };
         lane.retired = true;
-        self.index.remove(id);
-        self.seen_now.retain(|seen| *seen != id);
+        let pose = &self.pose.map_from_vehicle;
+        let visibility =
+            |point: &Point3<f64>| scene::visibility(&pose.inverse_transform_point(point), &self.sensor, &self.params);
+        lane.vote_missed((run.first, run.last), visibility, &self.params.landmark);
+        self.index.remove(run.lane);
+        self.seen_now.retain(|seen| *seen != run.lane);
         true
     }
 
@@ -340,7 +358,7 @@ impl Mapper {
                     && self.run_together(old_run, young_run)
                     && self.judge_pair(old, young, old_seen && young_seen)
                 {
-                    self.join(old, young);
+                    self.join(old_run, young);
                     joined.push(young);
                 }
             }
@@ -361,15 +379,16 @@ impl Mapper {
         self.lanes.get_mut(&young).is_some_and(|lane| duplicate::judge(lane, old, both_seen))
     }
 
-    fn join(&mut self, old: LaneId, young: LaneId) {
+    fn join(&mut self, old_run: &NearbyRun, young: LaneId) {
+        let old = old_run.lane;
         let Some(other) = self.lanes.remove(&young) else { return };
         self.index.remove(young);
         let seen = self.seen_now.contains(&young);
         self.seen_now.retain(|id| *id != young);
         if let Some(lane) = self.lanes.get_mut(&old) {
             lane.absorb(&other, &self.params.landmark);
-            let (first, last) = lane.knots();
-            self.index.update(old, lane.information(), first, last);
+            let (first, last) = scene::near_knots(lane, old_run);
+            self.index.update(old, lane.information(), first, last, self.way_m);
             if seen {
                 self.seen_now.push(old);
             }

@@ -215,6 +215,9 @@ pub struct LandmarkParams {
     pub shown_existence: f64,
     /// Lanes are published in the drive's map from this probability on: a map can wait for what a planner must know now.
     pub published_existence: f64,
+    /// What no frame saw for so much way is no longer looked for, metres: odometry has lost it, and coming back is the
+    /// fleet's matter, which closes loops.
+    pub left_behind_m: f64,
     /// A lane that this frame missed is shown in the local map if this much of it lies in the image, metres.
     pub shown_in_image_m: f64,
     /// A lane is shown in the local map if this much of it lies in the window, metres.
@@ -283,6 +286,7 @@ impl Params {
                 blind_range_m: 51.0,
                 shown_existence: 0.0,
                 published_existence: 0.0,
+                left_behind_m: f64::INFINITY,
                 shown_in_image_m: 0.0,
                 shown_in_window_m: 0.0,
             },
@@ -366,6 +370,7 @@ impl Params {
                 blind_range_m: 41.0,
                 shown_existence: 0.6,
                 published_existence: 0.9,
+                left_behind_m: 300.0,
                 shown_in_image_m: 8.0,
                 shown_in_window_m: 5.0,
             },

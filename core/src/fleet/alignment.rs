@@ -1,9 +1,10 @@
 //! Alignment: the corrections of drives and the places of lines, in one robust least-squares problem.
 //!
-//! Unknown are, per drive, the knots of its [`Correction`] and what all its GNSS fixes have in common, and, per station of
-//! a line, where the line lies across. Minimised is the sum of
+//! Unknown are, per drive, the knots of its [`Correction`], what all its GNSS fixes have in common and what all its odometry
+//! has in common, and, per station of a line, where the line lies across. Minimised is the sum of
 //!
-//! * `|c'_{k+1} - T_k(c_{k+1})|^2 / (q d) + (psi_{k+1} - psi_k)^2 / (q_psi d)`: odometry between knots,
+//! * `|c'_{k+1} - c'_k - (1 + a) R_k (c_{k+1} - c_k)|^2 / (q d) + (psi_{k+1} - psi_k - t d)^2 / (q_psi d) + a^2 / s_a^2 +
+//!   t^2 / s_t^2`: odometry between knots, whose scale and turn are off by the same `a` and `t` all through a drive,
 //! * `|C(p) + b - g|^2 / s_g^2 + |b|^2 / s_b^2`: fixes `g`, and their bias `b`, which is a drive's own,
 //! * `rho(n . C(p) - mu) / s^2`: a lane's sample against the station `mu` of its line, along the line's normal `n`.
 //!
@@ -52,7 +53,7 @@ pub(super) struct RobustScales {
     pub(super) fixes_m: f64,
 }
 
-/// Unknowns of a drive's horizontal problem: 3 per knot, and 2 of the bias.
+/// Unknowns of a drive's horizontal problem: 3 per knot, then 2 of the bias, 1 of odometry's scale, 1 of its turn.
 struct Layout {
     first: Vec<usize>,
     stations: usize,
@@ -123,7 +124,7 @@ fn align_horizontally(
     stations: usize,
     scales: RobustScales,
 ) {
-    let layout = Layout::new(corrections, 3, 2, stations);
+    let layout = Layout::new(corrections, 3, 4, stations);
     let mut equations = NormalEquations::new(layout.unknowns, WEAK);
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
         let first = layout.first[index];
@@ -158,17 +159,27 @@ fn align_horizontally(
 }
 
 fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &Restraints, correction: &Correction) {
+    let scale = first + 3 * correction.knots.len() + 2;
+    let turning = scale + 1;
     for (index, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
         let (before, after) = (first + 3 * index, first + 3 * (index + 1));
         let predicted = pair[0].apply(&pair[1].map);
         let residual = (pair[1].shared - predicted).xy();
         let by_yaw = pair[0].by_yaw(&pair[1].map);
+        let by_scale = (predicted - pair[0].shared).xy();
         let weight = 1.0 / step.position_m2;
-        equations.add(&[(after, 1.0), (before, -1.0), (before + 2, -by_yaw.x)], -residual.x, weight);
-        equations.add(&[(after + 1, 1.0), (before + 1, -1.0), (before + 2, -by_yaw.y)], -residual.y, weight);
+        for (axis, residual, by_yaw, by_scale) in
+            [(0, residual.x, by_yaw.x, by_scale.x), (1, residual.y, by_yaw.y, by_scale.y)]
+        {
+            let row = [(after + axis, 1.0), (before + axis, -1.0), (before + 2, -by_yaw), (scale, -by_scale)];
+            equations.add(&row, -residual, weight);
+        }
         let turn = pair[1].yaw_rad - pair[0].yaw_rad;
-        equations.add(&[(after + 2, 1.0), (before + 2, -1.0)], -turn, 1.0 / step.yaw_rad2);
+        let way_m = pair[1].arc_m - pair[0].arc_m;
+        equations.add(&[(after + 2, 1.0), (before + 2, -1.0), (turning, -way_m)], -turn, 1.0 / step.yaw_rad2);
     }
+    equations.add(&[(scale, 1.0)], 0.0, drive.drift_sigma.scale.powi(-2));
+    equations.add(&[(turning, 1.0)], 0.0, drive.drift_sigma.turn_rad_per_m.powi(-2));
 }
 
 fn add_fixes(

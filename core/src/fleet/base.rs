@@ -11,7 +11,7 @@ use super::{
     correction::{Correction, CorrectionKnot},
     fusion::Fusion,
     line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
-    prepared::{Restraints, SharedFix, normal_of},
+    prepared::{DriftSigma, Restraints, SharedFix, normal_of},
 };
 
 /// What the lines of a base are off by together, over tens of metres: the alignment that they were folded with is final,
@@ -93,7 +93,9 @@ impl Base {
         let fixes = if self.lines.is_empty() { Vec::new() } else { corners.into_iter().map(fix).collect() };
         // Without drives there are no fixes, and no bias is asked for.
         let bias_sigma_m = self.gnss_information.map(|information| information.max(1e-9).powf(-0.5));
-        Restraints { fixes, bias_sigma_m, stated_sigma_m: 0.0, steps: Vec::new() }
+        // It has no odometry: nothing asks for its drift.
+        let drift_sigma = DriftSigma { scale: 1.0, turn_rad_per_m: 1.0 };
+        Restraints { fixes, bias_sigma_m, stated_sigma_m: 0.0, drift_sigma, steps: Vec::new() }
     }
 }
 

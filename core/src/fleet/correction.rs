@@ -9,6 +9,8 @@
 use nalgebra::{Point3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
+use super::{contribution::TrajectoryPoint, params::FleetParams};
+
 /// One knot of a correction.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CorrectionKnot {
@@ -47,6 +49,25 @@ impl CorrectionKnot {
 }
 
 impl Correction {
+    /// The correction that puts the frame of a drive into the shared one as a whole, turned by `yaw_rad`.
+    pub(super) fn rigid(
+        trajectory: &[TrajectoryPoint],
+        yaw_rad: f64,
+        shared_from_map: impl Fn(&Point3<f64>) -> Point3<f64>,
+        params: &FleetParams,
+    ) -> Self {
+        let knots = knot_indices(trajectory, params.correction_knot_m).into_iter().map(|index| {
+            let point = &trajectory[index];
+            CorrectionKnot {
+                arc_m: point.arc_m,
+                map: point.position,
+                shared: shared_from_map(&point.position),
+                yaw_rad,
+            }
+        });
+        Self { knots: knots.collect() }
+    }
+
     /// The knots, in the order of travel.
     #[must_use]
     pub fn knots(&self) -> &[CorrectionKnot] {
@@ -91,4 +112,15 @@ impl Correction {
         let before = self.knots[knot].yaw_rad;
         if weight == 0.0 { before } else { before + (self.knots[knot + 1].yaw_rad - before) * weight }
     }
+}
+
+/// Indices of the trajectory points at which a correction has knots: the first, and one every `spacing_m`.
+pub(super) fn knot_indices(trajectory: &[TrajectoryPoint], spacing_m: f64) -> Vec<usize> {
+    let mut knots = vec![0];
+    for (index, point) in trajectory.iter().enumerate() {
+        if point.arc_m - trajectory[knots[knots.len() - 1]].arc_m >= spacing_m {
+            knots.push(index);
+        }
+    }
+    knots
 }

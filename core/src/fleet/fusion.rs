@@ -10,7 +10,6 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Point3, Rotation3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -19,6 +18,7 @@ use super::{
     change::MapChange,
     contribution::{Contribution, DriveId},
     correction::Correction,
+    georeferenced::UNBOUNDED_M,
     growth::{Growing, Pieces},
     line::{FusedLane, Lines},
     matching::match_lanes,
@@ -27,11 +27,7 @@ use super::{
     prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
     receivers::learned_shape_share,
 };
-use crate::geometry::{
-    Pose,
-    georeference::{Anchor, GeoreferenceFit},
-    pose::yaw_rad,
-};
+use crate::geometry::georeference::Anchor;
 
 /// How a drive lies in the map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -124,16 +120,14 @@ pub(super) struct Fusion<'a> {
 
 /// Distance between two stations of a line in the alignment, knots.
 const STATION_KNOTS: usize = 2;
-/// A robust scale beyond any residual, metres.
-const UNBOUNDED_M: f64 = 1e4;
 
 impl<'a> Fusion<'a> {
     fn new(base: &'a Base, drives: &'a [PreparedDrive<'a>], params: &'a FleetParams) -> Self {
-        let by_gnss: Vec<Option<Correction>> = drives.iter().map(|drive| by_gnss(drive, params)).collect();
-        let placed = by_gnss.iter().map(Option::is_some).collect();
-        let own = drives.iter().zip(by_gnss);
-        let own =
-            own.map(|(drive, found)| found.unwrap_or_else(|| drive.rigid_correction(0.0, |point| *point, params)));
+        let placed = drives.iter().map(|drive| drive.by_gnss.is_some()).collect();
+        let own = drives.iter().map(|drive| {
+            let unmoved = || Correction::rigid(&drive.contribution.trajectory, 0.0, |point| *point, params);
+            drive.by_gnss.clone().unwrap_or_else(unmoved)
+        });
         let corrections = own.chain([Correction::identity()]).collect();
         let lines = base.lines(drives.len(), &Correction::identity());
         let restraints = drives.iter().map(|drive| drive.restraints.clone());
@@ -374,24 +368,4 @@ impl<'a> Fusion<'a> {
         }
         any
     }
-}
-
-/// Where GNSS and odometry alone put a drive; `None` without fixes.
-fn by_gnss(drive: &PreparedDrive<'_>, params: &FleetParams) -> Option<Correction> {
-    let mut fit = GeoreferenceFit::default();
-    for point in &drive.contribution.trajectory {
-        if let Some(fix) = &point.fix {
-            fit.observe(fix, &Pose::new(point.position.coords, Vector3::z() * point.yaw_rad));
-        }
-    }
-    let yaw_rad = yaw_rad(&fit.georeference()?.enu_from_map);
-    let first = drive.restraints.fixes.first()?;
-    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad);
-    let shared_from_map = |point: &Point3<f64>| first.shared + turn * (point - first.map);
-    let mut corrections = [drive.rigid_correction(yaw_rad, shared_from_map, params)];
-    for fixes_m in [UNBOUNDED_M, 4.0 * params.gnss_robust_scale_m, 2.0 * params.gnss_robust_scale_m] {
-        align(&[&drive.restraints], &mut corrections, &[], 0, RobustScales { lanes_m: UNBOUNDED_M, fixes_m });
-    }
-    let [correction] = corrections;
-    Some(correction)
 }

@@ -9,7 +9,11 @@ pub struct FleetParams {
     pub sample_m: f64,
     /// Way between two knots of a line, metres.
     pub line_knot_m: f64,
-    /// Standard deviation of odometry's error in position over 1 m, which grows with the square root of the way, metres.
+    /// Standard deviation of the scale of a drive's odometry: 0.01 is 1 %.
+    pub odometry_scale_sigma: f64,
+    /// Standard deviation of the turn that a drive's odometry has too much all the way, radians per metre.
+    pub odometry_turn_sigma_rad_per_m: f64,
+    /// Standard deviation of odometry's error in position over 1 m, beside its scale, which grows with the square root of the way, metres.
     pub odometry_sigma_m: f64,
     /// The same of its heading, radians.
     pub odometry_sigma_rad: f64,
@@ -65,6 +69,8 @@ impl Default for FleetParams {
             correction_knot_m: 20.0,
             sample_m: 3.0,
             line_knot_m: 3.0,
+            odometry_scale_sigma: 0.01,
+            odometry_turn_sigma_rad_per_m: 2e-5,
             odometry_sigma_m: 0.015,
             odometry_sigma_rad: 0.0005,
             odometry_sigma_height_m: 0.015,

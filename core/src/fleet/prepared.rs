@@ -10,7 +10,8 @@ use nalgebra::{Point3, Vector2, Vector3};
 
 use super::{
     contribution::{Contribution, TrajectoryPoint},
-    correction::{Correction, CorrectionKnot},
+    correction::{Correction, knot_indices},
+    georeferenced::by_gnss,
     params::FleetParams,
 };
 use crate::{
@@ -27,6 +28,8 @@ pub(super) struct Restraints {
     pub(super) bias_sigma_m: [f64; 2],
     /// Mean of the standard deviations that the receiver states, horizontally, metres.
     pub(super) stated_sigma_m: f64,
+    /// What odometry is off by all through the drive.
+    pub(super) drift_sigma: DriftSigma,
     /// Odometry's variances between knot `i` and `i + 1` of the correction.
     pub(super) steps: Vec<OdometryStep>,
 }
@@ -36,6 +39,8 @@ pub(super) struct Restraints {
 pub(super) struct PreparedDrive<'a> {
     pub(super) contribution: &'a Contribution,
     pub(super) restraints: Restraints,
+    /// Where GNSS and odometry alone put it; `None` without fixes.
+    pub(super) by_gnss: Option<Correction>,
     pub(super) passes: Vec<PreparedPass<'a>>,
 }
 
@@ -58,7 +63,16 @@ pub(super) struct SharedFix {
     pub(super) sigma_m: [f64; 2],
 }
 
-/// What odometry is off by between two knots.
+/// Standard deviations of what odometry is off by all through a drive.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct DriftSigma {
+    /// Of the way: 0.01 is 1 %.
+    pub(super) scale: f64,
+    /// Of the heading, radians per metre of way.
+    pub(super) turn_rad_per_m: f64,
+}
+
+/// What odometry is off by between two knots, beside that.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct OdometryStep {
     pub(super) position_m2: f64,
@@ -97,7 +111,10 @@ const NEAR_M: f64 = 30.0;
 impl<'a> PreparedDrive<'a> {
     pub(super) fn new(contribution: &'a Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
         let trajectory = &contribution.trajectory;
-        let passes: Vec<&[TrajectoryPoint]> = passes(trajectory).into_iter().map(|range| &trajectory[range]).collect();
+        let restraints = Restraints::new(trajectory, anchor, params);
+        let by_gnss = by_gnss(trajectory, &restraints, params);
+        let passes = passes(&way(trajectory, by_gnss.as_ref()));
+        let passes: Vec<&[TrajectoryPoint]> = passes.into_iter().map(|range| &trajectory[range]).collect();
         let mut prepared: Vec<PreparedPass<'_>> =
             passes.iter().map(|way| PreparedPass { way, lanes: Vec::new() }).collect();
         for lane in contribution.lanes.iter().filter(|lane| lane.existence >= params.least_existence) {
@@ -106,27 +123,7 @@ impl<'a> PreparedDrive<'a> {
                 pass.lanes.extend(lane.seen_on(pass.way, params));
             }
         }
-        Self { contribution, restraints: Restraints::new(trajectory, anchor, params), passes: prepared }
-    }
-
-    /// The correction that puts the drive's frame into the shared one as a whole.
-    pub(super) fn rigid_correction(
-        &self,
-        yaw_rad: f64,
-        shared_from_map: impl Fn(&Point3<f64>) -> Point3<f64>,
-        params: &FleetParams,
-    ) -> Correction {
-        let trajectory = &self.contribution.trajectory;
-        let knots = knot_indices(trajectory, params.correction_knot_m).into_iter().map(|index| {
-            let point = &trajectory[index];
-            CorrectionKnot {
-                arc_m: point.arc_m,
-                map: point.position,
-                shared: shared_from_map(&point.position),
-                yaw_rad,
-            }
-        });
-        Correction { knots: knots.collect() }
+        Self { contribution, restraints, by_gnss, passes: prepared }
     }
 }
 
@@ -145,7 +142,9 @@ impl Restraints {
         }
         let knots = knot_indices(trajectory, params.correction_knot_m);
         let steps = knots.windows(2).map(|pair| step(&trajectory[pair[0]..=pair[1]], params)).collect();
-        Self { fixes, bias_sigma_m, stated_sigma_m, steps }
+        let drift_sigma =
+            DriftSigma { scale: params.odometry_scale_sigma, turn_rad_per_m: params.odometry_turn_sigma_rad_per_m };
+        Self { fixes, bias_sigma_m, stated_sigma_m, drift_sigma, steps }
     }
 
     /// Weighs what the fixes say of the shape of the way by another share of what the receiver states.
@@ -198,22 +197,31 @@ impl<'a> PreparedLane<'a> {
     }
 }
 
+/// A way as places with their arc length, in the shared frame where GNSS puts it there: by odometry alone a long way may
+/// come back to itself far from where it began.
+fn way(trajectory: &[TrajectoryPoint], by_gnss: Option<&Correction>) -> Vec<(f64, Point3<f64>)> {
+    let place = |point: &TrajectoryPoint| match by_gnss {
+        Some(correction) => correction.apply(&point.position, point.arc_m),
+        None => point.position,
+    };
+    trajectory.iter().map(|point| (point.arc_m, place(point))).collect()
+}
+
 /// Cuts a way where it comes back to itself.
-fn passes(trajectory: &[TrajectoryPoint]) -> Vec<Range<usize>> {
+fn passes(way: &[(f64, Point3<f64>)]) -> Vec<Range<usize>> {
     const STRIDE: usize = 3;
     let mut passes = Vec::new();
     let mut start = 0;
-    for (index, point) in trajectory.iter().enumerate() {
-        let comes_back = trajectory[start..index].iter().step_by(STRIDE).any(|earlier| {
-            point.arc_m - earlier.arc_m > LEAST_LOOP_M
-                && (point.position - earlier.position).xy().norm_squared() < NEAR_M * NEAR_M
+    for (index, (arc_m, place)) in way.iter().enumerate() {
+        let comes_back = way[start..index].iter().step_by(STRIDE).any(|(earlier_m, earlier)| {
+            arc_m - earlier_m > LEAST_LOOP_M && (place - earlier).xy().norm_squared() < NEAR_M * NEAR_M
         });
         if comes_back {
             passes.push(start..index);
             start = index;
         }
     }
-    passes.push(start..trajectory.len());
+    passes.push(start..way.len());
     passes
 }
 
@@ -226,17 +234,6 @@ fn shared_fix(point: &TrajectoryPoint, anchor: &Anchor) -> Option<SharedFix> {
         shared: anchor.enu_from_wgs84(&place),
         sigma_m: [fix.horizontal_sigma_m, fix.vertical_sigma_m],
     })
-}
-
-/// Indices of the trajectory points at which a correction has knots: the first, and one every `spacing_m`.
-fn knot_indices(trajectory: &[TrajectoryPoint], spacing_m: f64) -> Vec<usize> {
-    let mut knots = vec![0];
-    for (index, point) in trajectory.iter().enumerate() {
-        if point.arc_m - trajectory[knots[knots.len() - 1]].arc_m >= spacing_m {
-            knots.push(index);
-        }
-    }
-    knots
 }
 
 fn step(between: &[TrajectoryPoint], params: &FleetParams) -> OdometryStep {

@@ -73,7 +73,7 @@ mod tests {
     use nalgebra::{Point3, Vector3};
 
     use super::*;
-    use crate::fleet::prepared::SharedFix;
+    use crate::fleet::prepared::{DriftSigma, SharedFix};
 
     /// A drive whose fixes wander about its way by so much, and have a bias of their own.
     fn drive(number: u32, wander_m: f64) -> Restraints {
@@ -87,7 +87,14 @@ mod tests {
             let wander = Vector3::new(noise(0.7), noise(2.1), 0.0) * (wander_m / 3.0_f64.sqrt());
             SharedFix { arc_m, map, shared: map + wander + Vector3::new(1.0, -2.0, 0.0), sigma_m: [1.0, 1.0] }
         });
-        Restraints { fixes: fixes.collect(), bias_sigma_m: [1.5; 2], stated_sigma_m: 1.5, steps: Vec::new() }
+        let drift_sigma = DriftSigma { scale: 0.01, turn_rad_per_m: 1e-5 };
+        Restraints {
+            fixes: fixes.collect(),
+            bias_sigma_m: [1.5; 2],
+            stated_sigma_m: 1.5,
+            drift_sigma,
+            steps: Vec::new(),
+        }
     }
 
     #[test]

@@ -105,6 +105,18 @@ impl Extent {
         }
     }
 
+    /// Counts so many frames that reported nothing against what they had in view between two parameters.
+    pub fn vote_absent(&mut self, frames: u32, from: f64, to: f64, visibility: impl Fn(f64) -> f64) {
+        for stretch in stretch_of(from)..=stretch_of(to) {
+            let absent = f64::from(frames) * visibility(middle_of(stretch));
+            if absent > 0.0 {
+                #[allow(clippy::cast_possible_truncation)] // votes need no more than seven digits
+                let absent = absent as f32;
+                self.at_mut(stretch).absent += absent;
+            }
+        }
+    }
+
     fn at_mut(&mut self, stretch: i64) -> &mut Stretch {
         if self.stretches.is_empty() {
             self.first = stretch;

@@ -3,6 +3,9 @@
 //! A lane is cut into blocks of `BLOCK` knots; each block has a `kiddo` tree of its own, which is rebuilt only when a
 //! control point of it was added or moved by more than [`STALE_M`], and is listed in the cells of a coarse grid. A query
 //! costs what is near, not what the map holds. It may miss by [`STALE_M`], which the caller's radius allows for.
+//!
+//! A block that no frame touched for a long way is let go ([`LaneIndex::forget_touched_before`]): by odometry alone a vehicle that
+//! comes back does not find its old lanes where they were, and a street beside is taken for them.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -32,21 +35,34 @@ type Key = (LaneId, i64);
 pub struct LaneIndex {
     blocks: BTreeMap<Key, Block>,
     cells: BTreeMap<Cell, BTreeSet<Key>>,
+    /// Blocks by when they were touched last.
+    by_touch: BTreeSet<(Touch, Key)>,
+}
+
+/// Way of the vehicle when a block was touched last, in steps of [`TOUCH_STEP_M`].
+type Touch = u64;
+/// Metres.
+const TOUCH_STEP_M: f64 = 16.0;
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a way is not negative, and far below 2^53 steps
+fn touch_at(way_m: f64) -> Touch {
+    (way_m / TOUCH_STEP_M) as Touch
 }
 
 /// Control points of one lane as they were when the block was last built.
 #[derive(Clone, Debug)]
 struct Block {
     first: Knot,
+    touch: Touch,
     points: Vec<[f64; 3]>,
     tree: Option<Arc<ImmutableKdTree<f64, 3>>>,
 }
 
 impl Block {
-    fn new(first: Knot, points: Vec<[f64; 3]>) -> Self {
+    fn new(first: Knot, touch: Touch, points: Vec<[f64; 3]>) -> Self {
         // A tree over points that are finite cannot fail; without one the block is just not found.
         let tree = ImmutableKdTree::new_from_slice(&points).ok().map(Arc::new);
-        Self { first, points, tree }
+        Self { first, touch, points, tree }
     }
 
     fn is_stale(&self, first: Knot, points: &[[f64; 3]]) -> bool {
@@ -60,20 +76,21 @@ impl Block {
 /// What a snapshot keeps: the trees and the grid are made anew from the same points.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct StoredIndex {
-    blocks: Vec<(Key, Knot, Vec<[f64; 3]>)>,
+    blocks: Vec<(Key, Knot, Touch, Vec<[f64; 3]>)>,
 }
 
 impl From<LaneIndex> for StoredIndex {
     fn from(index: LaneIndex) -> Self {
-        Self { blocks: index.blocks.into_iter().map(|(key, block)| (key, block.first, block.points)).collect() }
+        let blocks = index.blocks.into_iter();
+        Self { blocks: blocks.map(|(key, block)| (key, block.first, block.touch, block.points)).collect() }
     }
 }
 
 impl From<StoredIndex> for LaneIndex {
     fn from(stored: StoredIndex) -> Self {
         let mut index = Self::default();
-        for (key, first, points) in stored.blocks {
-            index.put(key, Block::new(first, points));
+        for (key, first, touch, points) in stored.blocks {
+            index.put(key, Block::new(first, touch, points));
         }
         index
     }
@@ -96,20 +113,32 @@ fn cell_of(coordinate: f64) -> i64 {
 }
 
 impl LaneIndex {
-    /// Brings the blocks of a lane up to date for its knots from `first` to `last`, those that a frame touched.
+    /// Brings the blocks of a lane up to date for its knots from `first` to `last`, those that a frame touched after so much
+    /// way.
     pub fn update<const W: usize>(
         &mut self,
         lane: LaneId,
         information: &BandedInformation<W>,
         first: Knot,
         last: Knot,
+        way_m: f64,
     ) {
+        let touch = touch_at(way_m);
         for block in first.div_euclid(BLOCK)..=last.div_euclid(BLOCK) {
             let (first, points) = block_points(information, block);
             let key = (lane, block);
-            if self.blocks.get(&key).is_none_or(|old| old.is_stale(first, &points)) {
-                self.take(&key);
-                self.put(key, Block::new(first, points));
+            match self.blocks.get_mut(&key) {
+                Some(old) if !old.is_stale(first, &points) => {
+                    if old.touch != touch {
+                        self.by_touch.remove(&(old.touch, key));
+                        self.by_touch.insert((touch, key));
+                        old.touch = touch;
+                    }
+                }
+                _ => {
+                    self.take(&key);
+                    self.put(key, Block::new(first, touch, points));
+                }
             }
         }
     }
@@ -122,7 +151,19 @@ impl LaneIndex {
         }
     }
 
+    /// Lets go of blocks that no frame touched since the vehicle had come so far.
+    pub fn forget_touched_before(&mut self, way_m: f64) {
+        let limit = touch_at(way_m);
+        while let Some((touch, key)) = self.by_touch.first().copied() {
+            if touch >= limit {
+                break;
+            }
+            self.take(&key);
+        }
+    }
+
     fn put(&mut self, key: Key, block: Block) {
+        self.by_touch.insert((block.touch, key));
         for point in &block.points {
             self.cells.entry((cell_of(point[0]), cell_of(point[1]))).or_default().insert(key);
         }
@@ -131,6 +172,7 @@ impl LaneIndex {
 
     fn take(&mut self, key: &Key) {
         let Some(block) = self.blocks.remove(key) else { return };
+        self.by_touch.remove(&(block.touch, *key));
         for point in &block.points {
             let cell = (cell_of(point[0]), cell_of(point[1]));
             if let Some(keys) = self.cells.get_mut(&cell) {
@@ -204,8 +246,8 @@ mod tests {
 
     fn two_lanes() -> LaneIndex {
         let mut index = LaneIndex::default();
-        index.update(LaneId(1), &straight(0.0, 200), 0, 199);
-        index.update(LaneId(2), &straight(100.0, 200), 0, 199);
+        index.update(LaneId(1), &straight(0.0, 200), 0, 199, 0.0);
+        index.update(LaneId(2), &straight(100.0, 200), 0, 199, 0.0);
         index
     }
 
@@ -223,11 +265,24 @@ mod tests {
     }
 
     #[test]
+    fn blocks_that_no_frame_touched_for_long_are_no_longer_found_and_the_rest_of_their_lane_is() {
+        let mut index = two_lanes();
+        let lane = straight(0.0, 200);
+        index.update(LaneId(1), &lane, 150, 199, 500.0);
+        index.forget_touched_before(200.0);
+        assert!(index.within(&Point3::new(60.0, 0.0, 0.0), 20.0).is_empty());
+        assert!(index.within(&Point3::new(300.0, 100.0, 0.0), 20.0).is_empty());
+        assert_eq!(index.within(&Point3::new(540.0, 0.0, 0.0), 20.0).len(), 1);
+        index.forget_touched_before(600.0);
+        assert!(index.blocks.is_empty() && index.cells.is_empty() && index.by_touch.is_empty());
+    }
+
+    #[test]
     fn a_removed_lane_is_not_found_and_a_moved_one_is_found_where_it_went() {
         let mut index = two_lanes();
         index.remove(LaneId(1));
         assert!(index.within(&Point3::new(300.0, 0.0, 0.0), 20.0).is_empty());
-        index.update(LaneId(2), &straight(5.0, 200), 0, 199);
+        index.update(LaneId(2), &straight(5.0, 200), 0, 199, 0.0);
         assert_eq!(index.within(&Point3::new(300.0, 0.0, 0.0), 20.0).len(), 1);
         assert!(index.within(&Point3::new(300.0, 100.0, 0.0), 20.0).is_empty());
     }

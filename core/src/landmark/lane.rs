@@ -53,6 +53,8 @@ pub struct Landmark {
     pub last_seen: TimestampNs,
     /// Whether it was given up where it was last in view, and is kept for the stretch that had left it: seen no more.
     pub retired: bool,
+    /// Frames that missed it since it was seen last.
+    pub missed: u32,
     /// Another lane that may be the same, and how many frames spoke for it (negative: against).
     pub rival: Option<(LaneId, i32)>,
     information: BandedInformation<WIDTH>,
@@ -141,6 +143,7 @@ impl Landmark {
             first_seen: time,
             last_seen: time,
             retired: false,
+            missed: 0,
             rival: None,
             information: BandedInformation::new(points[0]),
             folded: BandedSum::default(),
@@ -378,6 +381,22 @@ impl Landmark {
                 sigma_at(&params.noise, range_m).powi(2)
             };
             extent.vote(&sighting, from, to, |parameter| visibility(&curve.point(parameter - head)), variance);
+        }
+        self.extent = extent;
+    }
+
+    /// Counts the frames that missed the lane since it was seen last against what they had in view: it was drawn too far.
+    pub fn vote_missed(
+        &mut self,
+        near: (Knot, Knot),
+        visibility: impl Fn(&Point3<f64>) -> f64,
+        params: &LandmarkParams,
+    ) {
+        let mut extent = std::mem::take(&mut self.extent);
+        if let Some(curve) = self.curve(params.ends) {
+            let head = self.information.head() as f64;
+            let (from, to) = ((near.0 as f64).max(head), (near.1 as f64).min(head + curve.last_parameter()));
+            extent.vote_absent(self.missed, from, to, |parameter| visibility(&curve.point(parameter - head)));
         }
         self.extent = extent;
     }

@@ -51,6 +51,7 @@
 pub mod alignment;
 pub mod base;
 pub mod cell;
+mod chain;
 pub mod change;
 pub mod contribution;
 pub mod correction;

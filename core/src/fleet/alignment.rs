@@ -17,7 +17,12 @@
 
 use nalgebra::{Point3, Vector2};
 
-use super::{correction::Correction, prepared::Restraints, sparse::NormalEquations};
+use super::{
+    chain::ChainEquations,
+    correction::Correction,
+    prepared::Restraints,
+    sparse::{Equations, NormalEquations},
+};
 
 /// Where a sample should lie along its normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,6 +65,28 @@ struct Layout {
     unknowns: usize,
 }
 
+/// Normal equations in the form that suits the problem.
+enum Solver {
+    Chain(ChainEquations),
+    Sparse(NormalEquations),
+}
+
+impl Equations for Solver {
+    fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
+        match self {
+            Self::Chain(chain) => chain.add(row, value, weight),
+            Self::Sparse(sparse) => sparse.add(row, value, weight),
+        }
+    }
+
+    fn solve(self) -> Option<Vec<f64>> {
+        match self {
+            Self::Chain(chain) => chain.solve(),
+            Self::Sparse(sparse) => sparse.solve(),
+        }
+    }
+}
+
 const GAUSS_NEWTON_STEPS: usize = 2;
 /// Holds what nothing else holds, 1/m^2.
 const WEAK: f64 = 1e-9;
@@ -95,6 +122,15 @@ impl Layout {
         let first: Vec<usize> = first.collect();
         Self { first, stations: next, unknowns: next + stations }
     }
+
+    /// No row yet: a chain where there is one drive, whose knots have the last `common` unknowns in common.
+    fn equations(&self, common: usize) -> Solver {
+        if self.first.len() == 1 && self.stations == self.unknowns {
+            Solver::Chain(ChainEquations::new(self.unknowns - common, self.unknowns, WEAK))
+        } else {
+            Solver::Sparse(NormalEquations::new(self.unknowns, WEAK))
+        }
+    }
 }
 
 /// Derivatives of `axis . C(p)` by the unknowns of the knots beside it.
@@ -125,7 +161,7 @@ fn align_horizontally(
     scales: RobustScales,
 ) {
     let layout = Layout::new(corrections, 3, 4, stations);
-    let mut equations = NormalEquations::new(layout.unknowns, WEAK);
+    let mut equations = layout.equations(4);
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
         let first = layout.first[index];
         add_odometry(&mut equations, first, drive, correction);
@@ -158,7 +194,7 @@ fn align_horizontally(
     }
 }
 
-fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &Restraints, correction: &Correction) {
+fn add_odometry(equations: &mut impl Equations, first: usize, drive: &Restraints, correction: &Correction) {
     let scale = first + 3 * correction.knots.len() + 2;
     let turning = scale + 1;
     for (index, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
@@ -183,7 +219,7 @@ fn add_odometry(equations: &mut NormalEquations, first: usize, drive: &Restraint
 }
 
 fn add_fixes(
-    equations: &mut NormalEquations,
+    equations: &mut impl Equations,
     first: usize,
     drive: &Restraints,
     correction: &Correction,
@@ -258,7 +294,7 @@ fn align_heights(
     scales: RobustScales,
 ) {
     let layout = Layout::new(corrections, 1, 1, stations);
-    let mut equations = NormalEquations::new(layout.unknowns, WEAK);
+    let mut equations = layout.equations(1);
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
         let first = layout.first[index];
         for (knot, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
@@ -299,7 +335,7 @@ fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Vec<(usiz
     row
 }
 
-fn add_fixed_heights(equations: &mut NormalEquations, first: usize, drive: &Restraints, correction: &Correction) {
+fn add_fixed_heights(equations: &mut impl Equations, first: usize, drive: &Restraints, correction: &Correction) {
     if drive.fixes.is_empty() {
         return;
     }

@@ -24,7 +24,7 @@ use super::{
     matching::match_lanes,
     params::FleetParams,
     placement::{Placement, place},
-    prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
+    prepared::{COARSE_STRIDE, PreparedDrive, PreparedPass, Restraints, normal_of},
     receivers::learned_shape_share,
 };
 use crate::geometry::georeference::Anchor;
@@ -119,7 +119,7 @@ pub(super) struct Fusion<'a> {
 }
 
 /// Distance between two stations of a line in the alignment, knots.
-const STATION_KNOTS: usize = 2;
+const STATION_KNOTS: usize = 4;
 
 impl<'a> Fusion<'a> {
     fn new(base: &'a Base, drives: &'a [PreparedDrive<'a>], params: &'a FleetParams) -> Self {
@@ -137,13 +137,13 @@ impl<'a> Fusion<'a> {
 
     fn run(&mut self) {
         self.place_all();
-        for _ in 0..self.params.rounds {
+        for _ in 1..self.params.rounds {
             self.align_all();
-            if self.learn_receivers() {
-                self.align_all();
-            }
-            self.draw_lines();
+            self.learn_receivers();
+            self.settle_lines();
         }
+        self.align_all();
+        self.draw_lines();
         if self.keep_apart_misfits() | self.keep_apart_strangers() {
             self.align_all();
             self.draw_lines();
@@ -191,7 +191,7 @@ impl<'a> Fusion<'a> {
                     let mut all = self.sightings_of(drive, before);
                     all.extend(sightings);
                     self.fit_one(drive, all, UNBOUNDED_M);
-                    for robust_scale_m in [4.0, 2.0, 1.0].map(|factor| factor * self.params.robust_scale_m) {
+                    for robust_scale_m in [3.0, 1.0].map(|factor| factor * self.params.robust_scale_m) {
                         let sightings = self.sightings_of(drive, &prepared.passes[..=index]);
                         self.fit_one(drive, sightings, robust_scale_m);
                     }
@@ -228,11 +228,11 @@ impl<'a> Fusion<'a> {
     /// Where lanes of some passes of a drive lie on lines.
     fn sightings_of(&self, drive: usize, passes: &[PreparedPass<'_>]) -> Vec<Sighting> {
         let mut sightings = Vec::new();
-        let deflation = self.params.lane_correlation_m / self.params.sample_m;
+        let deflation = self.params.lane_correlation_m / (COARSE_STRIDE as f64 * self.params.sample_m);
         for pass in passes {
-            let matched = match_lanes(&pass.lanes, &self.corrections[drive], &self.lines, self.params);
+            let matched = match_lanes(&pass.coarse_lanes, &self.corrections[drive], &self.lines, self.params);
             for (lane, run) in
-                pass.lanes.iter().zip(&matched).flat_map(|(lane, runs)| runs.iter().map(move |run| (lane, run)))
+                pass.coarse_lanes.iter().zip(&matched).flat_map(|(lane, runs)| runs.iter().map(move |run| (lane, run)))
             {
                 let Some(curve) = self.lines.lines[run.line].curve() else { continue };
                 let on_line = lane.samples[run.samples.clone()].iter().zip(&run.parameters);
@@ -284,16 +284,26 @@ impl<'a> Fusion<'a> {
         align(&restraints, &mut self.corrections, &sightings, stations, scales);
     }
 
-    /// Weighs the shape that receivers tell by how far they disagree about it; whether there are drives enough to know.
-    fn learn_receivers(&mut self) -> bool {
+    /// Weighs the shape that receivers tell, from the next alignment on, by how far they disagree about it.
+    fn learn_receivers(&mut self) {
         let drives = self.restraints.iter().zip(&self.corrections).zip(&self.placed);
         let placed: Vec<_> = drives.filter(|(_, placed)| **placed).map(|(drive, _)| drive).collect();
-        let Some(share) = learned_shape_share(&placed, self.params) else { return false };
+        let Some(share) = learned_shape_share(&placed, self.params) else { return };
         for (restraints, drive) in self.restraints.iter_mut().zip(self.drives) {
             restraints.fixes.clone_from(&drive.restraints.fixes);
             restraints.reweigh_shape(share, self.params);
         }
-        true
+    }
+
+    /// Moves the lines with their witnesses, whose drives were corrected anew.
+    fn settle_lines(&mut self) {
+        for line in &mut self.lines.lines {
+            for witness in line.knots.iter_mut().flat_map(|knot| &mut knot.witnesses) {
+                witness.shared = self.corrections[witness.drive].apply(&witness.map, witness.arc_m);
+            }
+            line.settle(self.params);
+        }
+        self.lines.index();
     }
 
     /// Makes the lines again from the corrections as they are.

@@ -7,9 +7,10 @@
 //! one line are correlated, a drive is one witness at each knot, however many frames saw it. Its variance is `1 / sum w_i`.
 //! Near the ends of a drive's lane its weight tapers off, so that the mean does not jump where a witness comes or goes.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 
 use nalgebra::{Point3, Vector2, Vector3};
+use rustc_hash::FxBuildHasher;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -154,7 +155,7 @@ pub(super) struct KnotRecord {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Lines {
     pub(super) lines: Vec<Line>,
-    grid: HashMap<(i32, i32), Vec<(u32, u32)>>,
+    grid: HashMap<(i32, i32), Vec<(u32, u32)>, FxBuildHasher>,
 }
 
 const CELL_M: f64 = 8.0;
@@ -337,21 +338,25 @@ impl Lines {
     /// The lines within a radius of a place, horizontally, each with its nearest knot, in the order of the lines.
     pub(super) fn near(&self, place: &Point3<f64>, radius_m: f64) -> Vec<(usize, usize)> {
         let (low, high) = (cell(place.x - radius_m, place.y - radius_m), cell(place.x + radius_m, place.y + radius_m));
-        let mut nearest: BTreeMap<u32, (f64, u32)> = BTreeMap::new();
+        // A handful of lines: a scan is quicker than a tree.
+        let mut nearest: Vec<(u32, f64, u32)> = Vec::new();
         for x in low.0..=high.0 {
             for y in low.1..=high.1 {
                 for (line, knot) in self.grid.get(&(x, y)).into_iter().flatten() {
                     let distance = (self.lines[*line as usize].points[*knot as usize] - place).xy().norm_squared();
-                    if distance <= radius_m * radius_m {
-                        let best = nearest.entry(*line).or_insert((distance, *knot));
-                        if distance < best.0 {
-                            *best = (distance, *knot);
-                        }
+                    if distance > radius_m * radius_m {
+                        continue;
+                    }
+                    match nearest.iter_mut().find(|(other, ..)| other == line) {
+                        Some(best) if distance < best.1 => (best.1, best.2) = (distance, *knot),
+                        Some(_) => {}
+                        None => nearest.push((*line, distance, *knot)),
                     }
                 }
             }
         }
-        nearest.into_iter().map(|(line, (_, knot))| (line as usize, knot as usize)).collect()
+        nearest.sort_unstable_by_key(|(line, ..)| *line);
+        nearest.into_iter().map(|(line, _, knot)| (line as usize, knot as usize)).collect()
     }
 }
 

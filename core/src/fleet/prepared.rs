@@ -49,7 +49,12 @@ pub(super) struct PreparedDrive<'a> {
 pub(super) struct PreparedPass<'a> {
     pub(super) way: &'a [TrajectoryPoint],
     pub(super) lanes: Vec<PreparedLane<'a>>,
+    /// The same lanes with every [`COARSE_STRIDE`]th sample: enough to fit a drive, which has few degrees of freedom.
+    pub(super) coarse_lanes: Vec<PreparedLane<'a>>,
 }
+
+/// Every how many samples of a lane one is used to fit its drive.
+pub(super) const COARSE_STRIDE: usize = 2;
 
 /// A GNSS fix in the shared frame.
 #[derive(Clone, Copy, Debug)]
@@ -116,12 +121,15 @@ impl<'a> PreparedDrive<'a> {
         let passes = passes(&way(trajectory, by_gnss.as_ref()));
         let passes: Vec<&[TrajectoryPoint]> = passes.into_iter().map(|range| &trajectory[range]).collect();
         let mut prepared: Vec<PreparedPass<'_>> =
-            passes.iter().map(|way| PreparedPass { way, lanes: Vec::new() }).collect();
+            passes.iter().map(|way| PreparedPass { way, lanes: Vec::new(), coarse_lanes: Vec::new() }).collect();
         for lane in contribution.lanes.iter().filter(|lane| lane.existence >= params.least_existence) {
             let Some(lane) = PreparedLane::new(lane, trajectory, params) else { continue };
             for pass in &mut prepared {
                 pass.lanes.extend(lane.seen_on(pass.way, params));
             }
+        }
+        for pass in &mut prepared {
+            pass.coarse_lanes = pass.lanes.iter().map(PreparedLane::coarse).collect();
         }
         Self { contribution, restraints, by_gnss, passes: prepared }
     }
@@ -184,6 +192,11 @@ impl<'a> PreparedLane<'a> {
         });
         let samples: Vec<LaneSample> = samples.collect();
         samples.iter().all(|sample| sample.tangent.x.is_finite()).then_some(Self { lane, curve, samples })
+    }
+
+    fn coarse(&self) -> Self {
+        let samples = self.samples.iter().step_by(COARSE_STRIDE).copied().collect();
+        Self { lane: self.lane, curve: self.curve, samples }
     }
 
     /// The runs of samples that were seen from a stretch of the way, each as a lane.

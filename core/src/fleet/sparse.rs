@@ -7,6 +7,15 @@ use faer::{
 };
 
 /// `sum w (a . x - b)^2`, to be minimised.
+pub(super) trait Equations {
+    /// Adds `weight (sum coefficient x[index] - value)^2`; no index twice.
+    fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64);
+
+    /// The solution, or `None` where the matrix is not positive definite.
+    fn solve(self) -> Option<Vec<f64>>;
+}
+
+/// Of any pattern.
 #[derive(Debug)]
 pub(super) struct NormalEquations {
     triplets: Vec<Triplet<usize, usize, f64>>,
@@ -19,9 +28,10 @@ impl NormalEquations {
         let triplets = (0..unknowns).map(|i| Triplet::new(i, i, weak)).collect();
         Self { triplets, right: vec![0.0; unknowns] }
     }
+}
 
-    /// Adds `weight (sum coefficient x[index] - value)^2`; no index twice.
-    pub(super) fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
+impl Equations for NormalEquations {
+    fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
         for (position, (i, a)) in row.iter().enumerate() {
             self.right[*i] += weight * a * value;
             // Only the lower half is kept.
@@ -30,8 +40,7 @@ impl NormalEquations {
         }
     }
 
-    /// The solution, or `None` where the matrix is not positive definite.
-    pub(super) fn solve(self) -> Option<Vec<f64>> {
+    fn solve(self) -> Option<Vec<f64>> {
         let unknowns = self.right.len();
         let matrix = SparseColMat::<usize, f64>::try_new_from_triplets(unknowns, unknowns, &self.triplets).ok()?;
         let factor = matrix.sp_cholesky(Side::Lower).ok()?;

@@ -85,7 +85,7 @@ impl Default for FleetParams {
             gate_height_m: 3.0,
             robust_scale_m: 0.3,
             most_misfit_m: 0.35,
-            least_shared: 0.15,
+            least_shared: 0.5,
             strangers_within_m: 70.0,
             drives_apart: 16,
             drives_per_fold: 16,

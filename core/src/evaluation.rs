@@ -6,6 +6,7 @@
 pub mod association_score;
 pub mod authors_scorer;
 mod chain;
+pub mod change_score;
 pub mod counts;
 pub mod fleet_score;
 pub mod ground_frame;
@@ -18,6 +19,7 @@ pub mod strict_scorer;
 
 pub use association_score::{AssociationMean, AssociationScore};
 pub use authors_scorer::score_authors;
+pub use change_score::{ChangeScore, TrueChange, score_changes};
 pub use counts::Counts;
 pub use fleet_score::{FleetScore, score_fleet};
 pub use ground_frame::GroundFrame;

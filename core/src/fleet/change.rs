@@ -52,7 +52,7 @@ pub struct MapChange {
 /// Farthest distance between the old and the new place of a line that was moved, metres.
 const MOVED_M: f64 = 2.5;
 /// Least number of knots of an event.
-const LEAST_KNOTS: usize = 2;
+const LEAST_KNOTS: usize = 4;
 /// Knots that may be missing from an event without cutting it in two.
 const BRIDGED_KNOTS: usize = 2;
 

@@ -10,7 +10,8 @@ use std::{collections::BTreeSet, path::PathBuf};
 
 use clap::{Args, ValueEnum};
 use lanemap_core::{
-    evaluation::{FleetScore, score_fleet},
+    TimestampNs,
+    evaluation::{ChangeScore, FleetScore, TrueChange, score_changes, score_fleet},
     fleet::{Contribution, FleetParams, FusedMap, fuse},
     geometry::georeference::Anchor,
     lane_map::EndRule,
@@ -41,6 +42,10 @@ pub struct FleetArgs {
     /// Share of a simulated fleet's drives whose lanes all lie one lane off
     #[arg(long, value_name = "P", default_value_t = 0.0, value_parser = share)]
     adversarial: f64,
+    /// Changes of the road that a simulated fleet drives over: so many stretches of line that vanish, that appear and that
+    /// move, between a quarter and three quarters of the drives
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1000))]
+    changes: u32,
     /// Seed of everything random: the same seed gives the same figures
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -84,6 +89,10 @@ pub struct Road {
     /// The true lines, metres east, north, up of the anchor.
     pub truth: Vec<Vec<Point3<f64>>>,
     pub anchor: Anchor,
+    /// What truly happened to it.
+    pub changes: Vec<TrueChange>,
+    /// Whether it is asked how well that was noticed.
+    pub changes_asked: bool,
 }
 
 /// The figures of one road at one number of drives: means over the choices of so many.
@@ -99,6 +108,8 @@ pub struct ByDrives {
     pub bytes: f64,
     /// Milliseconds of fusing, median.
     pub fuse_ms: f64,
+    /// How well changes of the road were noticed, where that is asked.
+    pub changes: Option<ChangeScore>,
 }
 
 /// Runs the measure.
@@ -137,6 +148,7 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
     let most = road.contributions.len();
     let choices = if choose && count < most { most } else { 1 };
     let (mut scores, mut apart, mut bytes, mut times, mut kept) = (Vec::new(), 0, 0.0, Vec::new(), None);
+    let mut changes = None;
     for first in 0..choices {
         let chosen: Vec<Contribution> =
             (0..count).map(|step| road.contributions[(first + step) % most].clone()).collect();
@@ -146,6 +158,7 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
         apart += map.drives.iter().filter(|drive| drive.correction.is_none()).count();
         bytes += contributed::packed_bytes(&map) as f64;
         scores.extend(score_fleet(&polylines(&map), &road.truth));
+        changes = road.changes_asked.then(|| noticed(road, &chosen, &map));
         kept = (!choose && count > 1).then(|| kept_names(road, count, &map));
     }
     let choices = choices as f64;
@@ -156,7 +169,17 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
         kept_names: kept,
         bytes: bytes / choices,
         fuse_ms: lanemap_core::evaluation::quantile(&mut times, 0.5),
+        changes,
     }
+}
+
+/// How well a map tells what happened while its drives were under way.
+fn noticed(road: &Road, drives: &[Contribution], map: &FusedMap) -> ChangeScore {
+    let mut starts: Vec<TimestampNs> = drives.iter().map(|drive| drive.started).collect();
+    starts.sort_unstable();
+    let over = starts.last().copied().unwrap_or_default();
+    let happened: Vec<TrueChange> = road.changes.iter().filter(|change| change.time < over).cloned().collect();
+    score_changes(&map.changes, &happened, &starts)
 }
 
 /// Share of the names in the map of one drive fewer that this map still has.

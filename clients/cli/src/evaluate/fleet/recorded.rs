@@ -69,7 +69,8 @@ fn road(folder: &Path, name: &str, drives: &[String]) -> anyhow::Result<Road> {
         contributions.push(contributed);
         truth.extend(true_lines(&folder.join("maps").join(drive.name()).with_extension("geojson"), origin)?);
     }
-    Ok(Road { name: name.to_owned(), contributions, truth, anchor })
+    // What happened to a recorded road is not known.
+    Ok(Road { name: name.to_owned(), contributions, truth, anchor, changes: Vec::new(), changes_asked: false })
 }
 
 fn receiver_pose(frame: &DriveFrame) -> anyhow::Result<Pose> {

@@ -1,6 +1,6 @@
 //! The figures of fused maps as tables and as JSON.
 
-use lanemap_core::evaluation::{FleetScore, fleet_score::Quantiles};
+use lanemap_core::evaluation::{ChangeScore, FleetScore, fleet_score::Quantiles};
 use serde_json::{Value, json};
 
 use super::{ByDrives, FleetArgs, Road};
@@ -41,12 +41,46 @@ fn as_json(figures: &[(&Road, Vec<ByDrives>)]) -> Value {
             "kept_ids": figure.kept_names,
             "bytes_per_km": 1000.0 * figure.bytes / figure.mean(|score| score.length_m).max(1.0),
             "fuse_ms": figure.fuse_ms,
+            "changes": figure.changes.map(changes_as_json),
         })
     };
     let roads = figures.iter().map(
         |(road, figures)| json!({ "road": road.name, "by_drives": figures.iter().map(by_drives).collect::<Vec<_>>() }),
     );
     json!({ "roads": roads.collect::<Vec<_>>() })
+}
+
+fn changes_as_json(changes: ChangeScore) -> Value {
+    json!({
+        "precision": changes.precision,
+        "recall": changes.recall,
+        "latency_drives_p50": changes.latency_drives_p50,
+        "false_removals": changes.false_removals,
+        "true_pieces": changes.true_pieces,
+        "reported_pieces": changes.reported_pieces,
+    })
+}
+
+/// How well changes were noticed, a line for each number of drives; nothing where that is not asked.
+fn changes_as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
+    let mut table = Table::new(&["road", "drives", "precision", "recall", "latency p50", "false removals", "pieces"]);
+    let asked = figures.iter().flat_map(|(road, figures)| figures.iter().map(move |figure| (road, figure)));
+    let mut any = false;
+    for (road, figure) in asked {
+        let Some(changes) = figure.changes else { continue };
+        any = true;
+        table.row(vec![
+            road.name.clone(),
+            figure.drives.to_string(),
+            format!("{:.3}", changes.precision),
+            format!("{:.3}", changes.recall),
+            format!("{:.0}", changes.latency_drives_p50),
+            changes.false_removals.to_string(),
+            changes.true_pieces.to_string(),
+        ]);
+    }
+    let heading = "Changes, per piece of 10 m; latency in drives.";
+    if any { format!("\n{heading}\n\n{}", table.render()) } else { String::new() }
 }
 
 fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
@@ -87,5 +121,9 @@ fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
             ]);
         }
     }
-    format!("Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}", table.render())
+    format!(
+        "Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}{}",
+        table.render(),
+        changes_as_text(figures)
+    )
 }

@@ -2,7 +2,7 @@
 
 use std::{env, error::Error, fs, path::PathBuf};
 
-const FILES: [&str; 7] = [
+const FILES: [&str; 8] = [
     "lanemap/v1/admin_service.proto",
     "lanemap/v1/geometry.proto",
     "lanemap/v1/observation.proto",
@@ -10,6 +10,7 @@ const FILES: [&str; 7] = [
     "lanemap/v1/ingest_service.proto",
     "lanemap/v1/map_service.proto",
     "lanemap/v1/shared_map.proto",
+    "lanemap/v1/spline_tile.proto",
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -4,6 +4,7 @@
 
 pub mod decode;
 pub mod encode;
+pub mod lane_name;
 pub mod zenoh_keys;
 
 /// Package `lanemap.v1`.

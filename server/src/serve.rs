@@ -20,6 +20,7 @@
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
 //! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
 //! | `/exports/{id}` | a cell for other programs: GeoJSON, FlatGeobuf, PMTiles, Lanelet2, OpenDRIVE; `format`, or a suffix |
+//! | `/styles/lanes.json` | a MapLibre style that draws them as paint |
 //! | `/splines/{z}/{x}/{y}` | the lines that touch a tile, as splines, protobuf `lanemap.v1.SplineTile` |
 //! | `/viewer` | a page that draws them |
 //! | `/healthz`, `/readyz`, `/metrics` | for operators |
@@ -51,6 +52,7 @@ mod session_trace;
 mod sessions;
 pub(crate) mod shared_lanes;
 mod splines;
+mod style;
 mod tile_cache;
 mod tiles;
 mod timeline;
@@ -150,7 +152,8 @@ impl FromRef<Shared> for Extents {
 
 /// Every HTTP route of the service, and the answer to requests that no route takes.
 ///
-/// Maps and metrics are for those who may read them; the viewer's page, which holds none, and health are for all.
+/// Maps and metrics are for those who may read them; the viewer's page and the style, which hold none, and health are for
+/// all.
 pub fn router(state: ServeState) -> Router {
     let (links, limits) = (LinkSettings::of(&state.config), Arc::new(Limits::of(&state.config)));
     let tiles = TileCache::new(state.map.clone(), state.config.max_cached_tile_bytes);
@@ -180,6 +183,7 @@ pub fn router(state: ServeState) -> Router {
         .route_layer(middleware::from_fn(require_read));
     Router::new()
         .merge(readers)
+        .route(style::PATH, get(style::style))
         .route("/viewer", get(viewer::page))
         .route("/viewer/", get(|base: LinkBase| async move { Redirect::permanent(&base.link("/viewer")) }))
         .route("/viewer/{name}", get(viewer::file))

@@ -60,6 +60,7 @@ pub mod mercator;
 pub mod mvt;
 pub mod overview;
 mod projected;
+pub mod spline;
 mod stretches;
 mod tile;
 

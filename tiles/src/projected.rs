@@ -72,7 +72,7 @@ pub(crate) struct PlaneBox {
 impl PlaneBox {
     /// The box around a spline: that of its control points, and as far again as a Catmull-Rom spline may swing out of them (a
     /// segment lies in the hull of its Bezier points, a sixth of the neighbours' distance off).
-    fn around(points: &[Point2<f64>]) -> Self {
+    pub(crate) fn around(points: &[Point2<f64>]) -> Self {
         let (mut low, mut high) = (points[0], points[0]);
         for point in points {
             (low, high) = (low.inf(point), high.sup(point));
@@ -217,7 +217,7 @@ fn plane_points(cell: CellId, lane: &v1::FusedLane) -> Vec<Point2<f64>> {
     points
 }
 
-fn place(border: Option<&v1::LaneBorder>) -> Option<lanemap_core::geometry::georeference::Wgs84> {
+pub(crate) fn place(border: Option<&v1::LaneBorder>) -> Option<lanemap_core::geometry::georeference::Wgs84> {
     let place = border?.place?;
     Some(lanemap_core::geometry::georeference::Wgs84 {
         latitude_deg: place.latitude_deg,

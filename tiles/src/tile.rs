@@ -2,10 +2,13 @@
 
 use std::{fmt, str::FromStr};
 
-use lanemap_core::fleet::{CellId, cell};
+use lanemap_core::{
+    fleet::{CellId, cell},
+    geometry::georeference::Wgs84,
+};
 use thiserror::Error;
 
-use crate::{BUFFER, EXTENT};
+use crate::{BUFFER, EXTENT, mercator::world_from_wgs84};
 
 /// A tile: a square of the web-mercator plane, counted from its north-western corner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -32,6 +35,16 @@ impl TileId {
     #[must_use]
     pub fn new(z: u8, x: u32, y: u32) -> Option<Self> {
         (z <= Self::MOST_ZOOM && x < 1 << z && y < 1 << z).then_some(Self { z, x, y })
+    }
+
+    /// The tile of a zoom in which a place lies; `None` within 5 degrees of a pole, where web mercator ends.
+    #[must_use]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in 0 .. 2^22")]
+    pub fn containing(z: u8, place: &Wgs84) -> Option<Self> {
+        let tiles = f64::from(1_u32.checked_shl(z.into())?);
+        let world = world_from_wgs84(place);
+        let (x, y) = (world.x.rem_euclid(1.0) * tiles, world.y * tiles);
+        (x.is_finite() && y >= 0.0 && y < tiles).then(|| Self::new(z, x as u32, y as u32))?
     }
 
     /// Zoom.
@@ -143,6 +156,14 @@ mod tests {
         assert_eq!(tile.cells_covered().len(), 16);
         assert_eq!(tile.cells_touched().len(), 36);
         assert!(tile.cells_touched().contains(&CellId::new((1 << 14) - 1, 5_685).unwrap()));
+    }
+
+    #[test]
+    fn a_place_lies_in_the_tile_of_its_cell() {
+        let munich = Wgs84 { latitude_deg: 48.1374, longitude_deg: 11.5755, height_m: 519.0 };
+        assert_eq!(TileId::containing(14, &munich), TileId::new(14, 8_718, 5_685));
+        assert_eq!(TileId::containing(14, &Wgs84 { latitude_deg: 89.0, ..munich }), None);
+        assert_eq!(TileId::containing(40, &munich), None);
     }
 
     #[test]

@@ -45,6 +45,16 @@ pub enum ClientError {
         /// What the service says about it.
         detail: String,
     },
+    /// There is no tile where one was asked for.
+    #[error("there is no tile of zoom {zoom} at latitude {latitude_deg}, longitude {longitude_deg}")]
+    NoSuchTile {
+        /// The zoom.
+        zoom: u8,
+        /// Latitude of the place, degrees.
+        latitude_deg: f64,
+        /// Longitude of the place, degrees.
+        longitude_deg: f64,
+    },
     /// A certificate or a token cannot be used.
     #[error("{0}")]
     Credentials(String),

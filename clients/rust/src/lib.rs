@@ -34,6 +34,25 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! The shared map is read tile by tile, as curves to compute with:
+//!
+//! ```no_run
+//! use lanemap_client::{MapClient, SplineTiles};
+//! # async fn example() -> Result<(), lanemap_client::ClientError> {
+//! let tiles = SplineTiles::new(MapClient::new("http://127.0.0.1:8080"), 256);
+//! for cell in tiles.at(48.1374, 11.5755, 16).await?.iter() {
+//!     for line in &cell.lines {
+//!         for point in line.curve.sample(1.0) {
+//!             let place = cell.anchor.wgs84_from_enu(&point.position);
+//!             let (sigma_m, existence) = (line.lateral_sigma_m_at(&point), line.existence_at(&point));
+//!             println!("{} {} {sigma_m} {existence}", place.latitude_deg, place.longitude_deg);
+//!         }
+//!     }
+//! }
+//! # Ok(())
+//! # }
+//! ```
 
 mod admin;
 mod backlog;
@@ -45,6 +64,7 @@ mod link;
 mod maps;
 mod reconnect;
 mod session;
+mod spline_tiles;
 mod spool;
 mod start;
 
@@ -57,5 +77,6 @@ pub use link::ConnectOptions;
 pub use maps::MapClient;
 pub use reconnect::Reconnect;
 pub use session::{IngestClient, Session, SessionSummary};
+pub use spline_tiles::SplineTiles;
 pub use spool::{SpoolError, SpoolOptions, SpoolRecovery, SpoolSync, SpooledDrive, WhenFull};
 pub use start::SessionStart;

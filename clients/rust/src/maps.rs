@@ -7,6 +7,7 @@ use std::{sync::Arc, time::Duration};
 use lanemap_core::LaneMap;
 use lanemap_proto::{decode, v1};
 use prost::Message;
+use reqwest::{StatusCode, header};
 use rustls::{
     ClientConfig, RootCertStore,
     pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
@@ -77,22 +78,44 @@ impl MapClient {
     }
 
     async fn get(&self, path: &str) -> Result<Vec<u8>, ClientError> {
+        let answer = self.get_newer(path, None).await?;
+        answer
+            .map(|answer| answer.body)
+            .ok_or_else(|| ClientError::Protocol("an answer that was not asked for".to_owned()))
+    }
+
+    /// What is at a path; `None` where that is what the reader holds under `held_tag`.
+    pub(crate) async fn get_newer(&self, path: &str, held_tag: Option<&str>) -> Result<Option<Answer>, ClientError> {
         let url = format!("{}{path}", self.base);
         let unreachable = |error: reqwest::Error| ClientError::Unreachable(with_sources(&error));
         let mut request = self.http.get(&url).timeout(TIMEOUT);
         if let Some(token) = self.credentials.bearer().await? {
             request = request.bearer_auth(token);
         }
+        if let Some(tag) = held_tag {
+            request = request.header(header::IF_NONE_MATCH, tag);
+        }
         let response = request.send().await.map_err(unreachable)?;
         let status = response.status();
+        if status == StatusCode::NOT_MODIFIED && held_tag.is_some() {
+            return Ok(None);
+        }
+        let tag = response.headers().get(header::ETAG).and_then(|tag| tag.to_str().ok()).map(str::to_owned);
         let body = response.bytes().await.map_err(unreachable)?;
         if status.is_success() {
-            return Ok(body.to_vec());
+            return Ok(Some(Answer { body: body.to_vec(), tag }));
         }
         let problem: serde_json::Value = serde_json::from_slice(&body).unwrap_or_default();
         let detail = problem["detail"].as_str().unwrap_or("no detail").to_owned();
         Err(ClientError::Http { url, status: status.as_u16(), detail })
     }
+}
+
+/// What was at a path.
+pub(crate) struct Answer {
+    pub(crate) body: Vec<u8>,
+    /// By which the service knows it again.
+    pub(crate) tag: Option<String>,
 }
 
 fn base(url: &str) -> String {

@@ -19,7 +19,12 @@ use axum::{
 use bytes::Bytes;
 use flate2::{Compression, write::GzEncoder};
 use lanemap_core::fleet::CellId;
-use lanemap_tiles::{ProjectedCell, TileId, vector_tile};
+use lanemap_tiles::{
+    ProjectedCell, TileId,
+    spline::{FittedCell, spline_tile},
+    vector_tile,
+};
+use prost::Message;
 use quick_cache::{Weighter, sync::Cache};
 
 use super::{entity_tag::EntityTag, in_background, problem::Problem, timeline::not_at_revision};
@@ -40,6 +45,8 @@ const ATTEMPTS: usize = 8;
 pub(super) enum TileKind {
     /// `/tiles/lanes`
     Vector,
+    /// `/splines`
+    Spline,
 }
 
 /// A tile of some versions of its cells.
@@ -56,6 +63,8 @@ pub(super) struct TileCache {
     map: SharedMap,
     made: Arc<Cache<TileVersion, Arc<MadeTile>, MemoryWeight>>,
     projected: Arc<Cache<(CellId, CellVersion), Arc<ProjectedCell>, MemoryWeight>>,
+    /// The newest version of each cell that was asked for: the next one takes what did not change from it.
+    fitted: Arc<Cache<CellId, Arc<FittedCell>, MemoryWeight>>,
 }
 
 /// A tile as it goes over the wire.
@@ -83,6 +92,12 @@ impl Weighter<(CellId, CellVersion), Arc<ProjectedCell>> for MemoryWeight {
     }
 }
 
+impl Weighter<CellId, Arc<FittedCell>> for MemoryWeight {
+    fn weight(&self, _: &CellId, cell: &Arc<FittedCell>) -> u64 {
+        cell.memory_bytes() as u64
+    }
+}
+
 /// Why a tile cannot be made.
 enum MakeError {
     Store(JournalError),
@@ -99,11 +114,12 @@ impl From<JournalError> for MakeError {
 impl TileCache {
     /// An empty cache of the tiles of a map, which takes at most `bytes`: half of them for tiles.
     pub(super) fn new(map: SharedMap, bytes: usize) -> Self {
-        let half = bytes as u64 / 2;
+        let bytes = bytes as u64;
         Self {
             map,
-            made: Arc::new(Cache::with_weighter(1024, half, MemoryWeight)),
-            projected: Arc::new(Cache::with_weighter(64, half, MemoryWeight)),
+            made: Arc::new(Cache::with_weighter(1024, bytes / 2, MemoryWeight)),
+            projected: Arc::new(Cache::with_weighter(64, bytes / 4, MemoryWeight)),
+            fitted: Arc::new(Cache::with_weighter(64, bytes / 4, MemoryWeight)),
         }
     }
 
@@ -196,6 +212,10 @@ impl TileCache {
                 let cells: Result<Vec<_>, _> = version.cells.iter().map(|cell| self.projected(*cell)).collect();
                 Ok(vector_tile(version.tile, cells?.iter().map(Arc::as_ref)))
             }
+            TileKind::Spline => {
+                let cells: Result<Vec<_>, _> = version.cells.iter().map(|cell| self.fitted(*cell)).collect();
+                Ok(spline_tile(version.tile, cells?.iter().map(Arc::as_ref)).encode_to_vec())
+            }
         }
     }
 
@@ -205,6 +225,19 @@ impl TileCache {
             let found = self.map.version_of(cell, version)?.ok_or(MakeError::Outdated)?;
             Ok(Arc::new(ProjectedCell::new(cell, &found.map)))
         })
+    }
+}
+
+impl TileCache {
+    fn fitted(&self, (cell, version): (CellId, CellVersion)) -> Result<Arc<FittedCell>, MakeError> {
+        let earlier = self.fitted.get(&cell);
+        if let Some(known) = earlier.as_ref().filter(|known| known.version() == version.0) {
+            return Ok(Arc::clone(known));
+        }
+        let found = self.map.version_of(cell, version)?.ok_or(MakeError::Outdated)?;
+        let fitted = Arc::new(FittedCell::new(cell, &found.map, earlier.as_deref()));
+        self.fitted.insert(cell, Arc::clone(&fitted));
+        Ok(fitted)
     }
 }
 

@@ -13,10 +13,11 @@ from google.protobuf.message import DecodeError
 from ._curves import Curve, curves_of
 from ._http import Http
 from ._link import Credentials
+from ._spline_tiles import curves_of_tile
 from ._values import Array
 from ._watch import Watch
 from .errors import MapError
-from .v1 import shared_map_pb2
+from .v1 import shared_map_pb2, spline_tile_pb2
 
 # Features, and cells, that are asked for at a time.
 PAGE = 1000
@@ -140,7 +141,10 @@ class Map:
     def splines(
         self, z: int | None = None, x: int | None = None, y: int | None = None, *, bbox: Sequence[float] | None = None
     ) -> list[Curve]:
-        """The lines of a tile, or of all cells that touch a box, as curves."""
+        """The lines of a tile, within 1 cm, or of all cells that touch a box, exactly, as curves.
+
+        A tile is small, and tells less: `first_seen_ns` of its lines is the start of the drive that they are named after.
+        """
         tile = (z, x, y)
         if bbox is not None:
             if tile != (None, None, None):
@@ -148,9 +152,9 @@ class Map:
             return [curve for cell in self.cells(bbox) if cell.lanes for curve in self.cell(cell.id)]
         if None in tile:
             raise ValueError(f"the tile is {tile}, limit: z, x and y, or a bbox")
-        message = shared_map_pb2.SplineTile()
+        message = spline_tile_pb2.SplineTile()
         self._message(f"/splines/{z}/{x}/{y}", message)
-        return [curve for cell in message.cells for curve in curves_of(cell)]
+        return curves_of_tile(message)
 
     def watch(
         self,

@@ -38,6 +38,8 @@ export class Server {
   /** Keeps a token for as long as the tab is open, and tries again with it. */
   unlock(token) {
     sessionStorage.setItem(TOKEN, token.trim());
+    // One that is refused is told as the first was.
+    this.enter("connecting");
     this.hurry();
   }
 

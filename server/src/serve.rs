@@ -7,8 +7,12 @@
 //! | `/sessions/live` | where the vehicles are that stream now; `bbox`, `limit` |
 //! | `/sessions/{id}/trace.geojson` | where the vehicle of a drive was, and when; `?crs=local`: in metres |
 //! | `/sessions/{id}/lanes.pb` | the same lanes as splines, protobuf `lanemap.v1.LaneMap` |
-//! | `/collections/lanes/items` | the lines of the shared map; `bbox`, `limit` |
-//! | `/collections/drives/items` | the lanes of all georeferenced drives, each as it alone saw them; `bbox`, `limit` |
+//! | `/`, `/conformance`, `/api`, `/collections` | OGC API - Features: where everything begins, and its description |
+//! | `/collections/lanes/items` | the lines of the shared map; `bbox`, `datetime`, `limit`, filters |
+//! | `/collections/control_points/items` | their control points, likewise |
+//! | `/collections/cells/items` | the cells as polygons, with the quality of their lines, likewise |
+//! | `/collections/drives/items` | the lanes of all georeferenced drives, each as it alone saw them, likewise |
+//! | `/collections/{collection}/items/{id}` | one of them |
 //! | `/cells` | the cells of the shared map: version, quality, whether they are up to date; `limit` |
 //! | `/cells/{id}` | one of them |
 //! | `/cells/{id}/lanes.geojson` | its lines in WGS84 |
@@ -37,11 +41,15 @@ pub mod entity_tag;
 mod exports;
 pub mod extents;
 pub mod features;
+mod form;
+mod html;
 pub(crate) mod items;
 mod lane_history;
 mod limits;
 pub mod line;
 pub mod link_base;
+mod ogc;
+mod openapi;
 mod operation;
 mod page;
 pub mod problem;
@@ -78,6 +86,12 @@ use self::{
     extents::Extents,
     limits::Limits,
     link_base::{LinkBase, LinkSettings},
+    ogc::{
+        collection::{COLLECTIONS, Collection},
+        feature_cache::FeatureCache,
+        landing,
+    },
+    openapi::{Api, Routes, operations},
     problem::{Problem, repeated},
     tile_cache::TileCache,
 };
@@ -122,7 +136,21 @@ struct Shared {
     state: ServeState,
     extents: Extents,
     tiles: TileCache,
+    cache: FeatureCache,
     links: LinkSettings,
+    api: Arc<Api>,
+}
+
+impl FromRef<Shared> for FeatureCache {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.cache.clone()
+    }
+}
+
+impl FromRef<Shared> for Arc<Api> {
+    fn from_ref(shared: &Shared) -> Self {
+        Arc::clone(&shared.api)
+    }
 }
 
 impl FromRef<Shared> for LinkSettings {
@@ -157,38 +185,13 @@ impl FromRef<Shared> for Extents {
 pub fn router(state: ServeState) -> Router {
     let (links, limits) = (LinkSettings::of(&state.config), Arc::new(Limits::of(&state.config)));
     let tiles = TileCache::new(state.map.clone(), state.config.max_cached_tile_bytes);
-    let readers = Router::new()
-        .route("/sessions", get(sessions::list))
-        .route("/sessions/{id}/lanes.geojson", get(sessions::lanes_geojson))
-        .route("/sessions/live", get(vehicles::live))
-        .route("/sessions/{id}/trace.geojson", get(session_trace::trace_geojson))
-        .route("/sessions/{id}/lanes.pb", get(sessions::lanes_protobuf))
-        .route(items::PATH, get(items::items))
-        .route(drive_items::PATH, get(drive_items::items))
-        .route("/cells", get(cells::list))
-        .route("/cells/{id}", get(cells::one))
-        .route("/cells/{id}/lanes.geojson", get(cells::lanes_geojson))
-        .route("/cells/{id}/lanes.pb", get(cells::lanes_protobuf))
-        .route("/cells/{id}/lanes/{lane}/history", get(lane_history::history))
-        .route("/differences", get(difference::differences))
-        .route("/timeline", get(timeline::timeline))
-        .route("/cells/{id}/changes", get(cells::changes_json))
-        .route("/cells/{id}/changes.pb", get(cells::changes_protobuf))
-        .route("/changes", get(changes::changes))
-        .route("/exports/{id}", get(exports::cell))
-        .route("/splines/{z}/{x}/{y}", get(splines::tile))
-        .route(tiles::PATH, get(tiles::tile_json))
-        .route("/tiles/lanes/{z}/{x}/{y}", get(tiles::tile))
-        .route("/metrics", get(operation::metrics))
-        .route_layer(middleware::from_fn(require_read));
+    let cache = FeatureCache::new(state.config.max_cached_feature_bytes);
+    let (readers, described) = for_readers().into_parts();
+    let (for_all, described_for_all) = for_all().into_parts();
+    let api = Arc::new(Api::of(&[described_for_all, described].concat()));
     Router::new()
-        .merge(readers)
-        .route(style::PATH, get(style::style))
-        .route("/viewer", get(viewer::page))
-        .route("/viewer/", get(|base: LinkBase| async move { Redirect::permanent(&base.link("/viewer")) }))
-        .route("/viewer/{name}", get(viewer::file))
-        .route("/healthz", get(operation::healthz))
-        .route("/readyz", get(operation::readyz))
+        .merge(readers.route_layer(middleware::from_fn(require_read)))
+        .merge(for_all)
         .fallback(no_such_path)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(encoding::layer())
@@ -196,7 +199,77 @@ pub fn router(state: ServeState) -> Router {
         .layer(middleware::from_fn_with_state(limits, limits::keep))
         .layer(middleware::from_fn(limits::head_as_get))
         .layer(cross_origin())
-        .with_state(Shared { state, extents: Extents::default(), tiles, links })
+        .with_state(Shared { state, extents: Extents::default(), tiles, cache, links, api })
+}
+
+/// What those may ask who may read: maps and metrics. Each route is described where it is added: see [`openapi`].
+fn for_readers() -> Routes {
+    COLLECTIONS
+        .iter()
+        .fold(Routes::new().get("/collections", landing::collections, operations::collections()), collection)
+        .get("/cells", cells::list, operations::cells())
+        .get("/cells/{id}", cells::one, operations::cell())
+        .get("/cells/{id}/lanes.geojson", cells::lanes_geojson, operations::cell_lanes_geojson())
+        .get("/cells/{id}/lanes.pb", cells::lanes_protobuf, operations::cell_lanes_protobuf())
+        .get("/cells/{id}/changes", cells::changes_json, operations::cell_changes_json())
+        .get("/cells/{id}/changes.pb", cells::changes_protobuf, operations::cell_changes_protobuf())
+        .get("/cells/{id}/lanes/{lane}/history", lane_history::history, operations::lane_history())
+        .get("/changes", changes::changes, operations::changes())
+        .get("/differences", difference::differences, operations::differences())
+        .get("/timeline", timeline::timeline, operations::timeline())
+        .get("/exports/{id}", exports::cell, operations::export())
+        .get("/splines/{z}/{x}/{y}", splines::tile, operations::spline_tile())
+        .get(tiles::PATH, tiles::tile_json, operations::tile_json())
+        .get("/tiles/lanes/{z}/{x}/{y}", tiles::tile, operations::vector_tile())
+        .get("/sessions", sessions::list, operations::sessions())
+        .get("/sessions/live", vehicles::live, operations::live_vehicles())
+        .get("/sessions/{id}/trace.geojson", session_trace::trace_geojson, operations::session_trace())
+        .get("/sessions/{id}/lanes.geojson", sessions::lanes_geojson, operations::session_lanes_geojson())
+        .get("/sessions/{id}/lanes.pb", sessions::lanes_protobuf, operations::session_lanes_protobuf())
+        .get("/metrics", operation::metrics, operations::metrics())
+}
+
+/// What anybody may ask: what there is to ask, health, and the viewer's page, which holds no map.
+fn for_all() -> Routes {
+    Routes::new()
+        .get("/", landing::landing, operations::landing())
+        .get("/conformance", landing::conformance, operations::conformance())
+        .get("/api", landing::api, operations::api())
+        .get("/healthz", operation::healthz, operations::health())
+        .get("/readyz", operation::readyz, operations::readiness())
+        .get(style::PATH, style::style, operations::style())
+        .undescribed("/viewer", get(viewer::page))
+        .undescribed("/viewer/", get(|base: LinkBase| async move { Redirect::permanent(&base.link("/viewer")) }))
+        .undescribed("/viewer/{name}", get(viewer::file))
+}
+
+/// The routes of one collection.
+fn collection(routes: Routes, of: &Collection) -> Routes {
+    let of = *of;
+    let path = format!("/collections/{}", of.id);
+    let routes = routes.get(
+        path,
+        move |state, extents, cache, base, uri, headers| {
+            landing::collection(of, state, extents, cache, base, uri, headers)
+        },
+        operations::collection(&of),
+    );
+    let (items_path, item_path) = (of.items_path(), format!("{}/{{id}}", of.items_path()));
+    let (of_items, of_item) = (operations::items(&of), operations::item(&of));
+    let Some(kind) = of.of_map else {
+        return routes.get(items_path, drive_items::items, of_items).get(item_path, drive_items::item, of_item);
+    };
+    routes
+        .get(
+            items_path,
+            move |state, cache, base, uri, headers| items::items((of, kind), state, cache, base, uri, headers),
+            of_items,
+        )
+        .get(
+            item_path,
+            move |state, cache, base, id, uri, headers| items::item((of, kind), state, cache, base, id, uri, headers),
+            of_item,
+        )
 }
 
 /// Pages of any origin may read what its user may.

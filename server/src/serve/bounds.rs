@@ -117,6 +117,13 @@ impl Bounds {
         across && self.south <= other.north && other.south <= self.north
     }
 
+    /// Whether all of another box, which does not cross the antimeridian, lies in this one, heights aside.
+    #[must_use]
+    pub fn holds(&self, other: &Self) -> bool {
+        let across = self.spans().into_iter().flatten().any(|(west, east)| west <= other.west && other.east <= east);
+        across && self.south <= other.south && other.north <= self.north
+    }
+
     /// Whether a line, cut at the antimeridian, enters this box.
     #[must_use]
     pub fn is_entered_by(&self, line: &[Coordinate]) -> bool {
@@ -136,6 +143,32 @@ impl Bounds {
         } else {
             [Some((self.west, 180.0)), Some((-180.0, self.east))]
         }
+    }
+
+    /// The smallest box around others: the longitudes that it leaves out are the widest that all of them do. `None` without
+    /// boxes.
+    #[must_use]
+    pub fn around_all(boxes: &[Self]) -> Option<Self> {
+        let mut spans: Vec<(f64, f64)> = boxes.iter().flat_map(|one| one.spans().into_iter().flatten()).collect();
+        spans.sort_unstable_by(|one, other| one.0.total_cmp(&other.0));
+        let (first_west, mut reached) = *spans.first()?;
+        // Width of each gap, its western and its eastern end.
+        let mut gaps = Vec::new();
+        for (west, east) in spans {
+            if west > reached {
+                gaps.push((west - reached, reached, west));
+            }
+            reached = reached.max(east);
+        }
+        gaps.push((first_west + 360.0 - reached, reached, first_west));
+        let (_, east, west) = gaps.into_iter().max_by(|one, other| one.0.total_cmp(&other.0))?;
+        Some(Self {
+            west,
+            south: boxes.iter().map(|one| one.south).fold(f64::INFINITY, f64::min),
+            east,
+            north: boxes.iter().map(|one| one.north).fold(f64::NEG_INFINITY, f64::max),
+            heights: None,
+        })
     }
 
     /// `[west, south, east, north]`, as GeoJSON writes a box.
@@ -198,6 +231,19 @@ mod tests {
         assert!(!bounds.is_entered_by(&[[178.0, 0.0, 0.0], [178.5, 0.0, 0.0]]));
         assert!(bounds.touches(&Bounds::parse("-179.5,0,-170,0.5").unwrap()));
         assert!(!bounds.touches(&Bounds::parse("-178,0,-170,0.5").unwrap()));
+    }
+
+    #[test]
+    fn the_box_around_others_leaves_out_the_widest_gap() {
+        let around = |boxes: &[&str]| {
+            let boxes: Vec<_> = boxes.iter().map(|text| Bounds::parse(text).unwrap()).collect();
+            Bounds::around_all(&boxes).map(|around| around.to_array())
+        };
+        assert_eq!(around(&[]), None);
+        assert_eq!(around(&["11,48,12,49"]), Some([11.0, 48.0, 12.0, 49.0]));
+        assert_eq!(around(&["11,48,12,49", "13,47,14,48", "11.5,48,13.5,48"]), Some([11.0, 47.0, 14.0, 49.0]));
+        assert_eq!(around(&["179,-1,-179,1", "-170,0,-160,2"]), Some([179.0, -1.0, -160.0, 2.0]));
+        assert_eq!(around(&["170,0,175,1", "-175,0,-170,1"]), Some([170.0, 0.0, -170.0, 1.0]));
     }
 
     #[test]

@@ -1,13 +1,14 @@
 //! `/collections/drives/items`: the lanes of all georeferenced sessions, as each drive alone saw them, a bounded page at a time.
 //!
 //! Pages are cut after a lane, not at an offset, so that a map that grows between two pages neither repeats nor hides a
-//! lane that was there all along: `after` names the last lane of the page before, which is not repeated.
+//! lane that was there all along: the cursor names the last lane of the page before, which is not repeated. Unlike the
+//! shared map's, earlier versions of a drive's map are not kept, so that each page is of now.
 
 use std::sync::Arc;
 
 use axum::{
-    extract::State,
-    http::{HeaderMap, Uri, header},
+    extract::{Path, State},
+    http::{HeaderMap, Uri},
     response::Response,
 };
 use lanemap_core::MapLane;
@@ -18,102 +19,140 @@ use super::{
     entity_tag::EntityTag,
     extents::Extents,
     features::{Crs, LaneFeature, feature},
-    in_background,
-    page::{MOST_COORDINATES, Page, PageQuery, links},
-    problem::Problem,
-    sessions::{GEOJSON, identity},
+    form, in_background,
+    line::rounded,
+    link_base::LinkBase,
+    ogc::{
+        MOST_COORDINATES,
+        collection::DRIVE_LANES,
+        cursor::{Cursor, DriveCursor},
+        filters::Filtered,
+        item_query::ItemQuery,
+    },
+    page::{PageFeatures, single},
+    problem::{Problem, repeated},
+    query::Parameters,
+    sessions::identity,
 };
 use crate::session::{PublishedMap, SessionId, SessionSummary, Sessions};
-
-/// Path of the collection's items.
-pub(super) const PATH: &str = "/collections/drives/items";
-
-/// The last lane of a page.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Cursor {
-    session: SessionId,
-    lane: u64,
-}
-
-impl Cursor {
-    fn parse(text: &str) -> Result<Self, String> {
-        let read =
-            |(session, lane): (&str, &str)| Some(Self { session: session.parse().ok()?, lane: lane.parse().ok()? });
-        text.split_once('.').and_then(read).ok_or_else(|| "it must be the id of a feature".to_owned())
-    }
-}
 
 /// `GET /collections/drives/items`
 pub(super) async fn items(
     State(state): State<ServeState>,
     State(extents): State<Extents>,
+    base: LinkBase,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let query = PageQuery::read(&uri, Cursor::parse)?;
+    let query = ItemQuery::read(&uri, &DRIVE_LANES)?;
+    form::accepts_geojson(&headers)?;
+    let after = match query.cursor {
+        None => None,
+        Some(Cursor::Drives(after)) => Some(after),
+        Some(Cursor::Map(_)) => return Err(query.foreign_cursor()),
+    };
     let summaries = state.sessions.list();
-    let asked = uri.query().unwrap_or_default().to_owned();
-    let tag = EntityTag::of((summaries.iter().map(|summary| identity(summary)).collect::<Vec<_>>(), &asked));
+    let identities: Vec<_> = summaries.iter().map(|summary| identity(summary)).collect();
+    let tag = EntityTag::of((identities, &query.written, base.as_str()));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let candidates = Candidates { summaries, sessions: state.sessions, extents };
-    let body = in_background(move || serde_json::to_vec(&page(&candidates, &query, &asked))).await?;
-    let body = body.map_err(|_| Problem::Internal)?;
-    Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
+    let drives = Drives { summaries, sessions: state.sessions, extents };
+    let (query, page) = in_background(move || {
+        let page = drives.page(&query, after);
+        (query, page)
+    })
+    .await?;
+    page.answer(&DRIVE_LANES, &query, &base, tag)
+}
+
+/// `GET /collections/drives/items/{id}`
+pub(super) async fn item(
+    State(state): State<ServeState>,
+    base: LinkBase,
+    Path(id): Path<String>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    Parameters::read(&uri, &[])?;
+    form::accepts_geojson(&headers)?;
+    let missing = || Problem::NoSuchFeature { collection: DRIVE_LANES.id, feature: repeated(&id) };
+    let named = |(session, lane): (&str, &str)| Some((session.parse::<SessionId>().ok()?, lane.parse::<u64>().ok()?));
+    let (session, lane) = id.split_once('.').and_then(named).ok_or_else(missing)?;
+    let map = in_background(move || state.sessions.get(&session)).await?.ok_or_else(missing)?;
+    let found = map.map.lanes.iter().find(|found| found.id.0 == lane).ok_or_else(missing)?;
+    let found = feature(&map, found, Crs::Wgs84).filter(|found| found.id == id).ok_or_else(missing)?;
+    let text = serde_json::to_vec(&found).map_err(|_| Problem::Internal)?;
+    let tag = EntityTag::of((&text, base.as_str()));
+    if tag.is_held_by(&headers) {
+        return Ok(tag.not_modified());
+    }
+    single(&DRIVE_LANES, &id, text, &base, &tag)
 }
 
 /// Where the lanes of a page are found.
-struct Candidates {
+struct Drives {
     summaries: Vec<Arc<SessionSummary>>,
     sessions: Sessions,
     extents: Extents,
 }
 
-/// The page that a query asks for; `asked` is the query as it was written.
-fn page(candidates: &Candidates, query: &PageQuery<Cursor>, asked: &str) -> Page<LaneFeature> {
-    let mut features = Vec::new();
-    let mut coordinates = 0;
-    let mut more = false;
-    'page: for map in candidates.maps(query) {
-        for lane in lanes(&map, query) {
-            let Some(found) = feature(&map, lane, Crs::Wgs84) else { continue };
-            if query.bounds.is_some_and(|bounds| !found.geometry.enters(&bounds)) {
-                continue;
+impl Drives {
+    /// The page after a lane, or the first.
+    fn page(&self, query: &ItemQuery, after: Option<DriveCursor>) -> PageFeatures {
+        let mut page = PageFeatures::default();
+        let mut last = None;
+        for map in self.maps(query, after) {
+            for lane in lanes(&map, query, after) {
+                let Some(found) = feature(&map, lane, Crs::Wgs84).filter(|found| is_wanted(found, query)) else {
+                    continue;
+                };
+                if page.returned == query.limit || page.coordinates >= MOST_COORDINATES {
+                    page.next = last.map(Cursor::Drives);
+                    return page;
+                }
+                // A feature is always text: its keys are, and its numbers are finite.
+                page.push(found.geometry.size(), |out| out.extend(serde_json::to_vec(&found).unwrap_or_default()));
+                last = Some(DriveCursor::at(map.session, lane.id.0));
             }
-            if features.len() == query.limit || coordinates >= MOST_COORDINATES {
-                more = true;
-                break 'page;
-            }
-            coordinates += found.geometry.size();
-            features.push(found);
         }
+        page
     }
-    let last = features.last().filter(|_| more).map(|last: &LaneFeature| last.id.clone());
-    Page { number_returned: features.len(), links: links(PATH, asked, last.as_deref()), features }
-}
 
-impl Candidates {
     /// The maps of georeferenced sessions from the cursor on that may enter the box, read one after the other.
-    fn maps(&self, query: &PageQuery<Cursor>) -> impl Iterator<Item = Arc<PublishedMap>> {
+    fn maps(&self, query: &ItemQuery, after: Option<DriveCursor>) -> impl Iterator<Item = Arc<PublishedMap>> {
         self.summaries
             .iter()
             .filter(|summary| summary.georeference.is_some())
-            .filter(|summary| query.after_exclusive.is_none_or(|after| summary.session >= after.session))
+            .filter(move |summary| after.is_none_or(|after| summary.session.to_key() >= after.session))
+            .filter(|summary| query.filters.session.as_ref().is_none_or(|name| *name == summary.session.to_string()))
             .filter(|summary| may_touch(query.bounds, || self.extents.of(summary)))
             .filter_map(|summary| self.sessions.get(&summary.session))
     }
 }
 
-/// The lanes of a map after the cursor that may enter the box.
-fn lanes<'a>(map: &'a PublishedMap, query: &'a PageQuery<Cursor>) -> impl Iterator<Item = &'a MapLane> {
+/// The lanes of a map after the cursor that may be wanted.
+fn lanes<'a>(
+    map: &'a PublishedMap,
+    query: &'a ItemQuery,
+    after: Option<DriveCursor>,
+) -> impl Iterator<Item = &'a MapLane> {
     map.map
         .lanes
         .iter()
-        .filter(|lane| {
-            query.after_exclusive.is_none_or(|after| Cursor { session: map.session, lane: lane.id.0 } > after)
-        })
+        .filter(move |lane| after.is_none_or(|after| DriveCursor::at(map.session, lane.id.0) > after))
+        .filter(|lane| query.filters.pass(&filtered(lane)))
+        .filter(|lane| query.interval.is_none_or(|interval| interval.meets(lane.first_seen.0, lane.last_seen.0)))
         .filter(|lane| may_touch(query.bounds, || around(map, lane)))
+}
+
+fn filtered(lane: &MapLane) -> Filtered {
+    let existence = rounded(lane.existence, 1e3);
+    Filtered { category: lane.category, drives: 1, existence, lateral_sigma_m: 0.0 }
+}
+
+fn is_wanted(found: &LaneFeature, query: &ItemQuery) -> bool {
+    query.bounds.is_none_or(|bounds| found.geometry.enters(&bounds))
 }
 
 /// Whether what lies within the box `around` it may enter `bounds`; never wrong where it says no.
@@ -148,14 +187,23 @@ mod tests {
             .collect()
     }
 
-    fn ask(query: &str) -> Page<LaneFeature> {
-        let uri = format!("{PATH}?{query}").parse().unwrap();
+    fn ask(query: &str) -> PageFeatures {
+        let uri = format!("/collections/drives/items?{query}").parse().unwrap();
         let sessions = Sessions::default();
         for map in three_sessions() {
             sessions.publish(map);
         }
-        let candidates = Candidates { summaries: sessions.list(), sessions, extents: Extents::default() };
-        page(&candidates, &PageQuery::read(&uri, Cursor::parse).unwrap(), query)
+        let drives = Drives { summaries: sessions.list(), sessions, extents: Extents::default() };
+        let query = ItemQuery::read(&uri, &DRIVE_LANES).unwrap();
+        let after = query.cursor.map(|cursor| match cursor {
+            Cursor::Drives(after) => after,
+            Cursor::Map(_) => panic!("a cursor of the drives"),
+        });
+        drives.page(&query, after)
+    }
+
+    fn features(page: &PageFeatures) -> Vec<serde_json::Value> {
+        serde_json::from_str(&format!("[{}]", std::str::from_utf8(&page.text).unwrap())).unwrap()
     }
 
     #[test]
@@ -164,10 +212,10 @@ mod tests {
         let mut seen = Vec::new();
         loop {
             let page = ask(&query);
-            assert!(page.number_returned <= 2);
-            seen.extend(page.features.iter().map(|feature| feature.id.clone()));
-            let Some(next) = page.links.iter().find(|link| link.rel == "next") else { break };
-            query = next.href.split_once('?').unwrap().1.to_owned();
+            assert!(page.returned <= 2);
+            seen.extend(features(&page).iter().map(|feature| feature["id"].as_str().unwrap().to_owned()));
+            let Some(next) = page.next else { break };
+            query = format!("limit=2&cursor={}", next.text());
         }
         let maps = three_sessions();
         let expected: Vec<_> = [0, 2]
@@ -180,28 +228,20 @@ mod tests {
 
     #[test]
     fn a_page_that_is_just_full_has_no_next() {
-        assert_eq!(ask("limit=6").links.len(), 1);
-        assert_eq!(ask("limit=5").links.len(), 2);
+        assert_eq!(ask("limit=6").next, None);
+        assert!(ask("limit=5").next.is_some());
     }
 
     #[test]
     fn a_box_around_one_session_gives_its_lanes_only() {
-        let page = ask("bbox=11.57,48.13,11.59,48.15");
-        assert_eq!(page.number_returned, 3);
-        assert!(page.features.iter().all(|feature| feature.properties.session == page.features[0].properties.session));
-        assert_eq!(ask("bbox=12,48,13,49").number_returned, 0);
-    }
-
-    #[test]
-    fn a_limit_or_cursor_out_of_range_is_refused() {
-        for (query, parameter) in
-            [("limit=0", "limit"), ("limit=10001", "limit"), ("limit=-1", "limit"), ("after=3", "after")]
-        {
-            let uri = format!("{PATH}?{query}").parse().unwrap();
-            let Err(Problem::BadParameter { name, .. }) = PageQuery::read(&uri, Cursor::parse) else {
-                panic!("{query}")
-            };
-            assert_eq!(name, parameter);
-        }
+        let found = features(&ask("bbox=11.57,48.13,11.59,48.15"));
+        assert_eq!(found.len(), 3);
+        let session = found[0]["properties"]["session"].as_str().unwrap();
+        assert!(found.iter().all(|feature| feature["properties"]["session"] == session));
+        assert_eq!(ask("bbox=12,48,13,49").returned, 0);
+        assert_eq!(ask(&format!("session={session}")).returned, 3);
+        assert_eq!(ask("category=yellow_solid").returned, 0);
+        assert_eq!(ask("min_existence=0.9").returned, 6);
+        assert_eq!(ask("min_existence=0.95").returned, 0);
     }
 }

@@ -10,7 +10,7 @@ use axum::{
     Router,
     extract::{FromRef, FromRequestParts, Request},
     http::{
-        HeaderMap, Uri,
+        HeaderMap, Uri, header,
         request::Parts,
         uri::{Authority, PathAndQuery},
     },
@@ -144,6 +144,15 @@ fn stripped(uri: &Uri, base_path: &BasePath) -> Option<Uri> {
     let mut parts = uri.clone().into_parts();
     parts.path_and_query = Some(rest.parse::<PathAndQuery>().ok()?);
     Uri::from_parts(parts).ok()
+}
+
+/// The header `Link` of an answer (RFC 8288): relation and target of each link.
+pub(super) fn link_header<'a>(
+    links: impl IntoIterator<Item = (&'a str, &'a str)>,
+) -> Option<(header::HeaderName, header::HeaderValue)> {
+    let links: Vec<String> = links.into_iter().map(|(rel, href)| format!("<{href}>; rel=\"{rel}\"")).collect();
+    let value = header::HeaderValue::from_str(&links.join(", ")).ok()?;
+    (!links.is_empty()).then_some((header::LINK, value))
 }
 
 #[cfg(test)]

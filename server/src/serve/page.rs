@@ -1,63 +1,109 @@
-//! What the pages of all collections have in common: how they are asked for, and how one leads to the next.
+//! A page of a collection as it is written: what is told of it, then its features.
 
-use axum::http::Uri;
+use axum::{http::header, response::Response};
+use lanemap_core::TimestampNs;
 use serde::Serialize;
 
 use super::{
-    bounds::Bounds,
+    entity_tag::EntityTag,
+    features::rfc3339,
+    link_base::{LinkBase, link_header},
+    ogc::{collection::Collection, cursor::Cursor, item_query::ItemQuery},
     problem::Problem,
-    query::{Parameters, parse_limit},
     sessions::{GEOJSON, Link},
 };
 
-/// Lines of a page, where the query does not say.
-pub(super) const DEFAULT_LIMIT: usize = 1_000;
-/// Most lines of a page.
-pub(super) const MOST_LINES: usize = 10_000;
-/// Most coordinates of a page; the line that reaches it is the page's last.
-pub(super) const MOST_COORDINATES: usize = 200_000;
-
-/// What a page is asked for; `C` names the last line of the page before.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct PageQuery<C> {
-    pub(super) bounds: Option<Bounds>,
-    pub(super) limit: usize,
-    pub(super) after_exclusive: Option<C>,
+/// Features on their way into a page.
+#[derive(Debug, Default)]
+pub(super) struct PageFeatures {
+    /// Their texts, with commas between them.
+    pub(super) text: Vec<u8>,
+    pub(super) returned: usize,
+    pub(super) coordinates: usize,
+    /// Where the next page begins, where there is one.
+    pub(super) next: Option<Cursor>,
+    /// Features on all pages, where they were counted.
+    pub(super) matched: Option<u64>,
 }
 
-/// One page.
-#[derive(Debug, Serialize)]
+/// What is told of a page.
+#[derive(Serialize)]
 #[serde(tag = "type", rename = "FeatureCollection")]
-pub(super) struct Page<F> {
+struct Head<'a> {
+    #[serde(rename = "numberMatched", skip_serializing_if = "Option::is_none")]
+    number_matched: Option<u64>,
     #[serde(rename = "numberReturned")]
-    pub(super) number_returned: usize,
-    pub(super) links: Vec<Link>,
-    pub(super) features: Vec<F>,
+    number_returned: usize,
+    #[serde(rename = "timeStamp")]
+    time_stamp: String,
+    links: &'a [Link],
 }
 
-impl<C> PageQuery<C> {
-    /// Reads a query; `parse_cursor` reads its `after`.
-    pub(super) fn read(uri: &Uri, parse_cursor: impl FnOnce(&str) -> Result<C, String>) -> Result<Self, Problem> {
-        let parameters = Parameters::read(uri, &["bbox", "limit", "after"])?;
-        Ok(Self {
-            bounds: parameters.get("bbox", Bounds::parse)?,
-            limit: parameters.get("limit", |text| parse_limit(text, MOST_LINES))?.unwrap_or(DEFAULT_LIMIT),
-            after_exclusive: parameters.get("after", parse_cursor)?,
-        })
+impl PageFeatures {
+    /// Appends a feature, which `write` writes.
+    pub(super) fn push(&mut self, coordinates: usize, write: impl FnOnce(&mut Vec<u8>)) {
+        if self.returned > 0 {
+            self.text.push(b',');
+        }
+        write(&mut self.text);
+        self.returned += 1;
+        self.coordinates += coordinates;
+    }
+
+    /// The answer that has them, made now.
+    pub(super) fn answer(
+        self,
+        collection: &Collection,
+        query: &ItemQuery,
+        base: &LinkBase,
+        tag: EntityTag,
+    ) -> Result<Response, Problem> {
+        let (tag, now_us) = tag.made_now();
+        let items = collection.items_path();
+        let link = |rel, path: &str| Link { rel, media_type: GEOJSON, href: base.link(path) };
+        let mut links = vec![link("self", &format!("{items}{}", query.written_with(query.cursor.as_ref())))];
+        if let Some(next) = &self.next {
+            links.push(link("next", &format!("{items}{}", query.written_with(Some(next)))));
+        }
+        let of = base.link(&format!("/collections/{}", collection.id));
+        links.push(Link { rel: "collection", media_type: "application/json", href: of });
+        let head = Head {
+            number_matched: self.matched,
+            number_returned: self.returned,
+            time_stamp: rfc3339(TimestampNs(i64::try_from(now_us.saturating_mul(1_000)).unwrap_or(i64::MAX))),
+            links: &links,
+        };
+        let mut body = serde_json::to_vec(&head).map_err(|_| Problem::Internal)?;
+        // The features follow within the object.
+        body.pop();
+        body.reserve_exact(self.text.len() + 32);
+        body.extend(b",\"features\":[");
+        body.extend(self.text);
+        body.extend(b"]}");
+        let mut response = tag.on(([(header::CONTENT_TYPE, GEOJSON)], body));
+        if let Some((name, value)) = link_header(links.iter().map(|link| (link.rel, link.href.as_str()))) {
+            response.headers_mut().insert(name, value);
+        }
+        Ok(response)
     }
 }
 
-/// Links from a page of a collection: to itself, and to the next, where there is more after the feature `last`.
-pub(super) fn links(path: &str, asked: &str, last: Option<&str>) -> Vec<Link> {
-    let link = |rel, query: &str| {
-        let mark = if query.is_empty() { "" } else { "?" };
-        Link { rel, media_type: GEOJSON, href: format!("{path}{mark}{query}") }
-    };
-    let next = last.map(|last| {
-        let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("after="));
-        let query: Vec<&str> = kept.collect();
-        let after = format!("after={last}");
-        link("next", &query.into_iter().chain([after.as_str()]).collect::<Vec<_>>().join("&"))
-    });
-    std::iter::once(link("self", asked)).chain(next).collect()
+/// One feature, as an answer: its text with links to itself and to its collection.
+pub(super) fn single(
+    collection: &Collection,
+    id: &str,
+    mut text: Vec<u8>,
+    base: &LinkBase,
+    tag: &EntityTag,
+) -> Result<Response, Problem> {
+    let (of, own) = (format!("/collections/{}", collection.id), format!("{}/{id}", collection.items_path()));
+    let links = [
+        Link { rel: "self", media_type: GEOJSON, href: base.link(&own) },
+        Link { rel: "collection", media_type: "application/json", href: base.link(&of) },
+    ];
+    text.pop();
+    text.extend(b",\"links\":");
+    text.extend(serde_json::to_vec(&links).map_err(|_| Problem::Internal)?);
+    text.push(b'}');
+    Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], text)))
 }

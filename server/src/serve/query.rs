@@ -42,13 +42,14 @@ impl Parameters {
     }
 }
 
-/// Reads the length of a page.
+/// Reads the length of a page; more than `most` counts as that (OGC 17-069r4, requirement 22).
 ///
 /// # Errors
-/// Any text but a whole number in `1 ..= most`.
+/// Any text but a whole number, 1 or more.
 pub fn parse_limit(text: &str, most: usize) -> Result<usize, String> {
-    let limit = text.parse().ok().filter(|limit| (1..=most).contains(limit));
-    limit.ok_or_else(|| format!("it must be a whole number in 1 ..= {most}"))
+    let limit = text.parse::<u64>().ok().filter(|limit| *limit >= 1);
+    let limit = limit.ok_or("it must be a whole number, 1 or more")?;
+    Ok(usize::try_from(limit).unwrap_or(usize::MAX).min(most))
 }
 
 #[cfg(test)]

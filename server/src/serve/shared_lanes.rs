@@ -6,12 +6,14 @@ use lanemap_core::{
     geometry::georeference::{Anchor, Wgs84},
 };
 use lanemap_proto::v1;
+use nalgebra::Point3;
 use serde::Serialize;
 
 use super::{
     bounds::Bounds,
     features::{LaneGeometry, category_name, on_the_earth, rfc3339},
     line::{Coordinate, drawn_through, rounded, written},
+    ogc::filters::Filtered,
 };
 use crate::fuse::wire::positions;
 
@@ -105,7 +107,30 @@ pub(super) fn feature_id(cell: &str, lane: &str, part: u32) -> String {
 
 /// Longitude, latitude and height along a line; its ends on a border are exact.
 pub(super) fn coordinates(anchor: &Anchor, lane: &v1::FusedLane) -> Vec<Coordinate> {
-    let line = drawn_through(&positions(lane));
+    on_the_earth_with_ends(anchor, lane, &drawn_through(&positions(lane)))
+}
+
+/// The same of its control points.
+pub(super) fn control_points(anchor: &Anchor, lane: &v1::FusedLane) -> Vec<Coordinate> {
+    on_the_earth_with_ends(anchor, lane, &positions(lane))
+}
+
+/// The category of a line, where this build knows it.
+pub(super) fn category(lane: &v1::FusedLane) -> Category {
+    Category::from_openlane_code(u8::try_from(lane.category).unwrap_or_default()).unwrap_or_default()
+}
+
+/// What filters look at in a line: the same figures as in its properties.
+pub(super) fn filtered(lane: &v1::FusedLane) -> Filtered {
+    Filtered {
+        category: category(lane),
+        drives: lane.drives,
+        existence: rounded(mean(&lane.existence_permille) / 1e3, 1e3),
+        lateral_sigma_m: median(&lane.lateral_sigma_mm) / 1e3,
+    }
+}
+
+fn on_the_earth_with_ends(anchor: &Anchor, lane: &v1::FusedLane, line: &[Point3<f64>]) -> Vec<Coordinate> {
     let mut coordinates: Vec<Coordinate> = line.iter().map(|point| written(anchor.wgs84_from_enu(point))).collect();
     for (border, end) in [(&lane.begins_at, coordinates.len().min(1)), (&lane.ends_at, coordinates.len())] {
         let place = border.as_ref().and_then(|border| border.place.as_ref());
@@ -121,8 +146,7 @@ pub(super) fn coordinates(anchor: &Anchor, lane: &v1::FusedLane) -> Vec<Coordina
 }
 
 fn properties(map: &v1::CellMap, lane: &v1::FusedLane) -> SharedLaneProperties {
-    let code = u8::try_from(lane.category).unwrap_or_default();
-    let category = Category::from_openlane_code(code).unwrap_or_default();
+    let Filtered { category, drives, existence, lateral_sigma_m } = filtered(lane);
     let beyond = |border: &Option<v1::LaneBorder>| {
         let name = border.as_ref()?.continues_in.as_ref()?;
         Some(feature_id(&name.cell, &name.id, name.part))
@@ -135,10 +159,10 @@ fn properties(map: &v1::CellMap, lane: &v1::FusedLane) -> SharedLaneProperties {
         category: category_name(category),
         category_code: category.openlane_code(),
         category_posterior: lane.category_posterior_permille.iter().map(|share| f64::from(*share) / 1e3).collect(),
-        drives: lane.drives,
+        drives,
         observations: lane.observations,
-        existence: rounded(mean(&lane.existence_permille) / 1e3, 1e3),
-        lateral_sigma_m: median(&lane.lateral_sigma_mm) / 1e3,
+        existence,
+        lateral_sigma_m,
         height_sigma_m: median(&lane.height_sigma_mm) / 1e3,
         first_seen: rfc3339(TimestampNs(lane.first_seen_unix_ns)),
         last_seen: rfc3339(TimestampNs(lane.last_seen_unix_ns)),

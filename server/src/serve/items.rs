@@ -245,7 +245,8 @@ struct FeatureName<'a> {
 impl<'a> FeatureName<'a> {
     fn parse(kind: MapCollection, id: &'a str) -> Option<Self> {
         let mut parts = id.split('.');
-        let cell = parts.next()?.parse().ok()?;
+        let named = parts.next()?;
+        let cell = named.parse::<CellId>().ok().filter(|cell| cell.to_string() == named)?;
         let mut name = Self { cell, lane: "", part: 0, within: None };
         if kind != MapCollection::Cells {
             name.lane = parts.next()?;

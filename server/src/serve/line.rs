@@ -103,10 +103,16 @@ pub(super) fn rounded(value: f64, scale: f64) -> f64 {
 
 /// Cuts a line in degrees where it crosses the antimeridian (RFC 7946, 3.1.9): each part stays on its own side.
 #[must_use]
-pub fn cut_at_antimeridian(line: Vec<Coordinate>) -> Vec<Vec<Coordinate>> {
+pub fn cut_at_antimeridian(mut line: Vec<Coordinate>) -> Vec<Vec<Coordinate>> {
     let mut parts = Vec::new();
     let mut part: Vec<Coordinate> = Vec::with_capacity(line.len());
-    for next in line {
+    if let [first, second, ..] = line.as_mut_slice() {
+        stay_beside(first, second[0]);
+    }
+    for mut next in line {
+        if let Some(last) = part.last() {
+            stay_beside(&mut next, last[0]);
+        }
         if let Some(last) = part.last().copied()
             && (next[0] - last[0]).abs() > 180.0
         {
@@ -115,7 +121,9 @@ pub fn cut_at_antimeridian(line: Vec<Coordinate>) -> Vec<Vec<Coordinate>> {
             let along = if gap == 0.0 { 0.0 } else { (side - last[0]) / gap };
             let between = |axis: usize, scale| rounded(last[axis] + (next[axis] - last[axis]) * along, scale);
             let (latitude, height) = (between(1, 1e7), between(2, 1e3));
-            part.push([side, latitude, height]);
+            if last[0].abs() < 180.0 {
+                part.push([side, latitude, height]);
+            }
             parts.push(std::mem::take(&mut part));
             part.push([-side, latitude, height]);
         }
@@ -123,6 +131,13 @@ pub fn cut_at_antimeridian(line: Vec<Coordinate>) -> Vec<Vec<Coordinate>> {
     }
     parts.push(part);
     parts
+}
+
+/// A place on the antimeridian lies on the side of the one beside it.
+fn stay_beside(place: &mut Coordinate, longitude: f64) {
+    if place[0].abs() >= 180.0 && longitude != 0.0 {
+        place[0] = place[0].copysign(longitude);
+    }
 }
 
 #[cfg(test)]
@@ -177,6 +192,21 @@ mod tests {
         assert_eq!(parts[0].last(), Some(&[180.0, 10.001, 2.0]));
         assert_eq!(parts[1].first(), Some(&[-180.0, 10.001, 2.0]));
         assert_eq!(parts[1].len(), 3);
+    }
+
+    #[test]
+    fn a_line_that_ends_on_the_antimeridian_stays_on_its_side_and_one_through_a_point_there_is_cut_there() {
+        for (end, other) in [(180.0, 180.0), (-180.0, 180.0)] {
+            let parts = cut_at_antimeridian(vec![[179.9998, 10.0, 1.0], [179.9999, 10.0, 1.0], [end, 10.0, 1.0]]);
+            assert_eq!(parts.len(), 1);
+            assert_eq!(parts[0].last(), Some(&[other, 10.0, 1.0]));
+        }
+        let begun = cut_at_antimeridian(vec![[180.0, 10.0, 1.0], [-179.9999, 10.0, 1.0]]);
+        assert_eq!(begun, [vec![[-180.0, 10.0, 1.0], [-179.9999, 10.0, 1.0]]]);
+        let through = cut_at_antimeridian(vec![[179.9999, 10.0, 1.0], [-180.0, 10.0, 1.0], [-179.9999, 10.0, 1.0]]);
+        let [before, after] = through.as_slice() else { panic!("{through:?}") };
+        assert_eq!(before, &[[179.9999, 10.0, 1.0], [180.0, 10.0, 1.0]]);
+        assert_eq!(after, &[[-180.0, 10.0, 1.0], [-179.9999, 10.0, 1.0]]);
     }
 
     #[test]

@@ -7,6 +7,7 @@ use super::{
     parameters::{BBOX, CRS, FORM, LIMIT, Parameter, path_id, whole_number},
     schemas::{bytes, named, text},
 };
+use crate::export::Format;
 use crate::serve::{
     ogc::collection::Collection,
     sessions::{GEOJSON, PROTOBUF},
@@ -164,12 +165,18 @@ pub(in crate::serve) fn style() -> Operation {
 pub(in crate::serve) fn export() -> Operation {
     let format = Parameter::new(
         "format",
-        "The format; without it, that of the suffix of the cell's name.",
-        || json!({ "type": "string", "format": "lanemap-export-format" }),
+        "The format; without it, that of the suffix of the name, else of Accept.",
+        || json!({ "type": "string", "enum": Format::ALL.map(Format::name) }),
+    );
+    let traffic = Parameter::new(
+        "traffic",
+        "The side of the road on which vehicles drive.",
+        || json!({ "type": "string", "enum": ["right", "left"], "default": "right" }),
     );
     let operation = Operation::new("export", CELLS, "A cell for other programs.");
-    let operation = operation.describes("GeoJSON, FlatGeobuf, PMTiles, Lanelet2 and OpenDRIVE.");
-    operation.at(CELL_ID).takes([format]).answers("*/*", bytes())
+    let operation = operation.describes("GeoJSON, FlatGeobuf, PMTiles, Lanelet2 or OpenDRIVE.");
+    let operation = operation.at(CELL_ID).takes([format, traffic]);
+    Format::ALL.into_iter().fold(operation, |operation, format| operation.answers(format.media_type(), bytes()))
 }
 
 pub(in crate::serve) fn lane_history() -> Operation {

@@ -238,7 +238,7 @@ fn as_json(cells: &[CellSplines]) -> Value {
 }
 
 fn golden(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/golden").join(name)
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden").join(name)
 }
 
 /// Lines of every kind: bends, a border that goes on under another name and one that ends there, a line of two control

@@ -305,9 +305,10 @@ async fn every_feature_has_an_address_of_its_own_and_others_are_not_found() {
             assert!(link(&single, "self").unwrap().ends_with(id) && link(&single, "collection").is_some());
             single.as_object_mut().unwrap().remove("links");
             assert_eq!(single, *feature);
-            for wrong in
-                [format!("{id}x"), format!("{id}."), format!("0{id}"), id.replace("14-", "15-"), "x".to_owned()]
-            {
+            let others =
+                [format!("{id}x"), format!("{id}."), format!("0{id}"), id.replace("14-", "15-"), "x".to_owned()];
+            // A drive's id names no cell.
+            for wrong in others.into_iter().filter(|other| other != id) {
                 let url = format!("{}/collections/{collection}/items/{wrong}", service.server.url());
                 assert_eq!(get(&url).await.status(), StatusCode::NOT_FOUND, "{url}");
             }

@@ -14,6 +14,8 @@ const EXACT = { type: "geojson", maxzoom: 22, tolerance: 0, data: EMPTY };
 const TILES_TO = 20;
 /** How far from a line a click still means it, pixels. */
 const REACH_PX = 8;
+/** Part of a chord between two places at which a line is looked for. */
+const STEP_OF_CHORD = 1 / 16;
 
 export class LaneMap {
   /** Resolves once the style is drawn. */
@@ -172,9 +174,14 @@ export class LaneMap {
     const free = [[left, top], [clientWidth - right, clientHeight - bottom]];
     for (const { geometry, properties } of this.map.queryRenderedFeatures(free, { layers: this.#clickable() })) {
       if (!properties.lane) continue;
-      for (const place of geometry.type === "LineString" ? geometry.coordinates : geometry.coordinates.flat()) {
-        const { x, y } = this.map.project(place);
-        if (x > free[0][0] && x < free[1][0] && y > free[0][1] && y < free[1][1]) return [x, y];
+      for (const line of geometry.type === "LineString" ? [geometry.coordinates] : geometry.coordinates) {
+        const pixels = line.map((place) => this.map.project(place));
+        // A straight line may cross the free part with no vertex in it.
+        for (let at = 0; at < pixels.length - 1; at += STEP_OF_CHORD) {
+          const [from, to, share] = [pixels[Math.floor(at)], pixels[Math.floor(at) + 1], at % 1];
+          const [x, y] = [from.x + (to.x - from.x) * share, from.y + (to.y - from.y) * share];
+          if (x > free[0][0] && x < free[1][0] && y > free[0][1] && y < free[1][1]) return [x, y];
+        }
       }
     }
     return undefined;

@@ -1,9 +1,9 @@
 //! How well changes of the road were noticed: precision and recall per stretch of 10 m, and how many drives it took.
 //!
 //! Both the true changes and the reported ones are told as paint that went and paint that came: a line that moved went from one
-//! place and came to another. They are cut into pieces of [`PIECE_M`]. A true piece is recalled if a report of the same
-//! sense, made since, passes within [`NEAR_M`] of its middle; a reported piece is right if a true one of the same sense and
-//! before it lies so near. A report that a line moved speaks for both: where it is now, and, within [`MOVED_M`], where it was.
+//! place and came to another. They are cut into pieces of [`PIECE_M`] metres. A true piece is recalled if a report of the same
+//! sense, made since, passes within 1.5 m of its middle; a reported piece is right if a true one of the same sense and
+//! before it lies so near. A report that a line moved speaks for both: where it is now, and, within 3 m, where it was.
 //! The latency of a change is the number of drives that began after it, up to and with the one by which its first report
 //! came to be believed.
 //!

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { after, before, test } from "node:test";
-import { DESK, PHONE, launch, open, picture, untilDrawn } from "./stage.mjs";
+import { DESK, PHONE, launch, middleOfSomeLine, open, picture, untilDrawn } from "./stage.mjs";
 
 const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
 
@@ -23,7 +23,10 @@ async function found(page) {
 for (const [device, options] of [["desk", DESK], ["phone", PHONE]]) {
   for (const colorScheme of ["light", "dark"]) {
     test(`axe finds nothing serious on a ${device} in the ${colorScheme}`, async () => {
-      const { page, close } = await open(browser, { ...options, colorScheme, reducedMotion: "reduce" });
+      // Near enough that a line crosses what a phone shows of the map.
+      const { latitude, longitude } = await middleOfSomeLine();
+      const place = `#at=16/${latitude}/${longitude}`;
+      const { page, close } = await open(browser, { ...options, colorScheme, reducedMotion: "reduce" }, place);
       await untilDrawn(page);
       const where = `${device}-${colorScheme}`;
       assert.deepEqual(await found(page), [], "the map");

@@ -55,6 +55,18 @@ export const total = (page, name) =>
   page.locator(`[data-total="${name}"]`).evaluate((element) => Number.parseFloat(element.textContent));
 export const hash = (page, name) => new URLSearchParams(new URL(page.url()).hash.slice(1)).get(name);
 
+/** Latitude and longitude of the middle of the line with most places. */
+export async function middleOfSomeLine() {
+  let cells = [];
+  while (!cells.some(({ lanes }) => lanes > 0)) ({ cells } = await (await fetch(`${demo}/cells`)).json());
+  const [cell] = cells.toSorted((one, other) => other.line_km - one.line_km);
+  const { features } = await (await fetch(`${demo}/cells/${cell.id}/lanes.geojson`)).json();
+  const [longest] = features.toSorted((one, other) => other.geometry.coordinates.length - one.geometry.coordinates.length);
+  const { coordinates } = longest.geometry;
+  const [longitude, latitude] = coordinates[Math.floor(coordinates.length / 2)];
+  return { latitude, longitude };
+}
+
 /** Takes a picture of a page that stands still. */
 export async function picture(page, name) {
   await settled(page);

@@ -5,7 +5,8 @@ import { after, before, test } from "node:test";
 import { writeFileSync } from "node:fs";
 import { join } from "node:path";
 import {
-  DESK, PATIENCE_MS, PHONE, demo, hash, launch, linesOnScreen, open, picture, scratch, settled, shareOfPixels, total, untilDrawn,
+  DESK, PATIENCE_MS, PHONE, demo, hash, launch, linesOnScreen, middleOfSomeLine, open, picture, scratch, settled, shareOfPixels,
+  total, untilDrawn,
 } from "./stage.mjs";
 
 let browser;
@@ -85,11 +86,7 @@ test("layers are chosen by keyboard, each has a scale with units, and a link bri
 
 test("near the road lines are paint, and a click on one tells its history", async () => {
   // A link to the middle of some line, so near that paint has its true breadth.
-  const [cell] = (await cells()).toSorted((one, other) => other.line_km - one.line_km);
-  const { features } = await (await fetch(`${demo}/cells/${cell.id}/lanes.geojson`)).json();
-  const [longest] = features.toSorted((one, other) => other.geometry.coordinates.length - one.geometry.coordinates.length);
-  const { coordinates } = longest.geometry;
-  const [longitude, latitude] = coordinates[Math.floor(coordinates.length / 2)];
+  const { latitude, longitude } = await middleOfSomeLine();
   const { page, complaints, close } = await open(browser, { ...DESK, colorScheme: "dark" }, `#at=19/${latitude}/${longitude}`);
   await untilDrawn(page);
   const paint = await shareOfPixels(page, (r, g, b) => r > 150 && g > 120 && b > 20);

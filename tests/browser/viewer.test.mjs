@@ -14,7 +14,6 @@ before(async () => (browser = await launch()));
 after(() => browser.close());
 
 const sessions = async () => (await (await fetch(`${demo}/sessions`)).json()).sessions;
-const cells = async () => (await (await fetch(`${demo}/cells`)).json()).cells;
 
 test("lines are drawn and grow while vehicles drive, without a complaint or a request to another host", async () => {
   const { page, complaints, close } = await open(browser, { ...DESK, colorScheme: "light" });

@@ -22,7 +22,7 @@ use super::{
     line::rounded,
     link_base::LinkBase,
     problem::{Problem, repeated},
-    query::{Parameters, parse_limit},
+    query::{Parameters, parse_limit, whole_number},
     sessions::{GEOJSON, Link, PROTOBUF},
     shared_lanes::{SharedLane, cell_lanes, feature_id, shared_lane},
 };
@@ -250,8 +250,8 @@ pub(super) async fn published(map: &SharedMap, id: &str) -> Result<(CellId, Arc<
 }
 
 async fn changes(map: &SharedMap, base: &LinkBase, id: &str, uri: &Uri) -> Result<(CellId, v1::CellChanges), Problem> {
-    let whole_number = |text: &str| text.parse().map_err(|_| "it must be a version, a whole number".to_owned());
-    let since = Parameters::read(uri, &["since"])?.get("since", whole_number)?.unwrap_or(0);
+    let version = |text: &str| whole_number(text).ok_or_else(|| "it must be a version, a whole number".to_owned());
+    let since = Parameters::read(uri, &["since"])?.get("since", version)?.unwrap_or(0);
     let (cell, _) = known(map, id)?;
     let map = map.clone();
     let changes = in_background(move || map.changes_since(cell, since)).await?;

@@ -36,6 +36,7 @@ pub(super) struct Operation {
     forms: Vec<(&'static str, Value)>,
     refusals: Vec<(u16, &'static str)>,
     has_tag: bool,
+    may_be_empty: bool,
     is_for_all: bool,
 }
 
@@ -52,6 +53,7 @@ impl Operation {
             forms: vec![],
             refusals: vec![],
             has_tag: true,
+            may_be_empty: false,
             is_for_all: false,
         }
     }
@@ -94,6 +96,12 @@ impl Operation {
         self
     }
 
+    /// The answer may be that there is nothing: 204.
+    pub(super) fn may_be_empty(mut self) -> Self {
+        self.may_be_empty = true;
+        self
+    }
+
     /// Anybody may ask.
     pub(super) fn for_all(mut self) -> Self {
         self.is_for_all = true;
@@ -130,6 +138,9 @@ impl Operation {
             responses.insert("304".into(), json!({ "$ref": "#/components/responses/NotModified" }));
         }
         responses.insert("200".into(), answer);
+        if self.may_be_empty {
+            responses.insert("204".into(), json!({ "description": "There is nothing here." }));
+        }
         let common = [
             (400, "A query parameter is unknown, malformed, or stands more than once."),
             (406, "No form of the answer is acceptable."),

@@ -47,9 +47,15 @@ impl Parameters {
 /// # Errors
 /// Any text but a whole number, 1 or more.
 pub fn parse_limit(text: &str, most: usize) -> Result<usize, String> {
-    let limit = text.parse::<u64>().ok().filter(|limit| *limit >= 1);
-    let limit = limit.ok_or("it must be a whole number, 1 or more")?;
+    let limit = whole_number(text).filter(|limit| *limit >= 1).ok_or("it must be a whole number, 1 or more")?;
     Ok(usize::try_from(limit).unwrap_or(usize::MAX).min(most))
+}
+
+/// Reads a whole number that is not negative; one that is too large to count by counts as the largest.
+#[must_use]
+pub fn whole_number(text: &str) -> Option<u64> {
+    let is_one = !text.is_empty() && text.bytes().all(|digit| digit.is_ascii_digit());
+    is_one.then(|| text.parse().unwrap_or(u64::MAX))
 }
 
 #[cfg(test)]
@@ -69,6 +75,15 @@ mod tests {
     #[test]
     fn a_parameter_that_stands_twice_is_refused() {
         assert_eq!(read("limit=1&limit=2").unwrap_err(), Problem::RepeatedParameter { name: "limit".into() });
+    }
+
+    #[test]
+    fn a_number_beyond_the_most_counts_as_the_most_and_a_text_is_none() {
+        assert_eq!(parse_limit("99999999999999999999999", 7), Ok(7));
+        assert_eq!(parse_limit("3", 7), Ok(3));
+        for text in ["", "0", "-1", "+1", "1.0", "x"] {
+            assert!(parse_limit(text, 7).is_err(), "{text}");
+        }
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! The collections, and what their features are filtered by.
 
 use crate::serve::openapi::parameters::{
-    BBOX, BBOX_CRS, CATEGORY, CELL, CURSOR, DATETIME, DRIVES, LANE, LIMIT, MAX_LATERAL_SIGMA_M, MIN_DRIVES,
-    MIN_EXISTENCE, Parameter, SESSION,
+    BBOX, BBOX_CRS, CATEGORY, CELL, DATETIME, DRIVES, DRIVES_CURSOR, LANE, LIMIT, MAP_CURSOR, MAX_LATERAL_SIGMA_M,
+    MIN_DRIVES, MIN_EXISTENCE, Parameter, SESSION,
 };
 
 /// A collection of the shared map, whose features lie in cells.
@@ -81,7 +81,8 @@ pub(in crate::serve) const COLLECTIONS: [Collection; 4] = [LANES, CONTROL_POINTS
 impl Collection {
     /// Every query parameter of its items.
     pub(in crate::serve) fn parameters(&self) -> Vec<Parameter> {
-        [BBOX, BBOX_CRS, DATETIME, LIMIT, CURSOR].into_iter().chain(self.filters.iter().copied()).collect()
+        let cursor = if self.of_map.is_some() { MAP_CURSOR } else { DRIVES_CURSOR };
+        [BBOX, BBOX_CRS, DATETIME, LIMIT, cursor].into_iter().chain(self.filters.iter().copied()).collect()
     }
 
     /// Address of its items.

@@ -23,6 +23,7 @@ use crate::serve::{
     form::{self, Form},
     html, in_background,
     items::of_cell,
+    line::rounded,
     link_base::LinkBase,
     openapi::{OPENAPI, page},
     problem::Problem,
@@ -173,7 +174,10 @@ impl Told {
         };
         let mut extent = Map::new();
         if let Some(around) = Bounds::around_all(&boxes) {
-            extent.insert("spatial".into(), json!({ "bbox": [around.to_array()], "crs": CRS84 }));
+            extent.insert(
+                "spatial".into(),
+                json!({ "bbox": [around.to_array().map(|degrees| rounded(degrees, 1e7))], "crs": CRS84 }),
+            );
         }
         if let Some((first, last)) = seen {
             let trs = "http://www.opengis.net/def/uom/ISO-8601/0/Gregorian";

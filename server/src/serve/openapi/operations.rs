@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use super::{
     OPENAPI, Operation,
-    parameters::{BBOX, CRS, FORM, LIMIT, Parameter, path_id, whole_number},
+    parameters::{BBOX, CRS, FORM, LIMIT, Parameter, path_id, revision, whole_number},
     schemas::{bytes, named, text},
 };
 use crate::export::Format;
@@ -27,7 +27,7 @@ const SESSION_ID: Parameter = path_id("id", "Name of a drive's session.");
 const FEATURE_ID: Parameter = path_id("id", "Id of a feature.");
 const SINCE: Parameter = whole_number("since", "The version that the reader has; without it, 0: nothing.");
 const REVISION: Parameter =
-    whole_number("revision", "The map as it was at this revision, or nearly so; without it, as it is now.");
+    revision("revision", "The map as it was at this revision, or nearly so; without it, as it is now.");
 /// Parameters of the changes of the map.
 const CHANGES: [Parameter; 4] = [
     Parameter::new(
@@ -142,7 +142,7 @@ pub(in crate::serve) fn spline_tile() -> Operation {
     let operation =
         Operation::new("splineTile", CELLS, "The lines that touch a tile, as splines: lanemap.v1.SplineTile.");
     let [z, x, y] = tile_place();
-    operation.at(z).at(x).at(y).answers(PROTOBUF, bytes())
+    operation.at(z).at(x).at(y).answers(PROTOBUF, bytes()).may_be_empty()
 }
 
 pub(in crate::serve) fn tile_json() -> Operation {
@@ -153,7 +153,7 @@ pub(in crate::serve) fn tile_json() -> Operation {
 pub(in crate::serve) fn vector_tile() -> Operation {
     let [z, x, y] = tile_place();
     let operation = Operation::new("vectorTile", TILES, "The lines in a tile as a Mapbox vector tile.");
-    let operation = operation.at(z).at(x).at(y).takes([REVISION]).answers(VECTOR_TILE, bytes());
+    let operation = operation.at(z).at(x).at(y).takes([REVISION]).answers(VECTOR_TILE, bytes()).may_be_empty();
     operation.refuses(410, "That state of the map is not kept.")
 }
 
@@ -176,7 +176,10 @@ pub(in crate::serve) fn export() -> Operation {
     let operation = Operation::new("export", CELLS, "A cell for other programs.");
     let operation = operation.describes("GeoJSON, FlatGeobuf, PMTiles, Lanelet2 or OpenDRIVE.");
     let operation = operation.at(CELL_ID).takes([format, traffic]);
-    Format::ALL.into_iter().fold(operation, |operation, format| operation.answers(format.media_type(), bytes()))
+    Format::ALL.into_iter().fold(operation, |operation, format| {
+        let is_json = format == Format::GeoJson;
+        operation.answers(format.media_type(), if is_json { json!({ "type": "object" }) } else { bytes() })
+    })
 }
 
 pub(in crate::serve) fn lane_history() -> Operation {
@@ -187,14 +190,18 @@ pub(in crate::serve) fn lane_history() -> Operation {
 }
 
 pub(in crate::serve) fn differences() -> Operation {
-    let since = whole_number("since", "The revision of the map with which it is compared; without it, 0: nothing.");
+    let since = revision("since", "The revision of the map with which it is compared; without it, 0: nothing.");
     let operation = Operation::new("differences", CELLS, "Where the map is another one than it was at a revision.");
     let operation = operation.takes([since, BBOX]).answers(GEOJSON, named("Differences"));
     operation.refuses(410, "That state of the map is not kept.")
 }
 
 pub(in crate::serve) fn timeline() -> Operation {
-    let steps = whole_number("steps", "Most steps into which time is cut, 1 or more.");
+    let steps = Parameter::new(
+        "steps",
+        "Most steps into which time is cut; there is a most of that, too.",
+        || json!({ "type": "integer", "minimum": 1 }),
+    );
     let operation = Operation::new("timeline", CELLS, "When the map changed: revisions to go back to.");
     operation.takes([steps]).answers(JSON, named("Timeline"))
 }

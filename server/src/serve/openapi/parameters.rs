@@ -2,7 +2,10 @@
 
 use serde_json::{Value, json};
 
-use crate::serve::{features::category_name, ogc::MOST_FEATURES};
+use crate::serve::{
+    features::category_name,
+    ogc::{DEFAULT_FEATURES, MOST_FEATURES},
+};
 
 /// A parameter of a request.
 #[derive(Clone, Copy, Debug)]
@@ -51,7 +54,7 @@ fn count() -> Value {
 }
 
 fn limit() -> Value {
-    json!({ "type": "integer", "minimum": 1, "maximum": MOST_FEATURES, "default": 1000 })
+    json!({ "type": "integer", "minimum": 1, "maximum": MOST_FEATURES, "default": DEFAULT_FEATURES })
 }
 
 fn bbox() -> Value {
@@ -75,6 +78,11 @@ pub(in crate::serve) const fn path_id(name: &'static str, description: &'static 
 
 /// A whole number in the query, or in the path.
 pub(in crate::serve) const fn whole_number(name: &'static str, description: &'static str) -> Parameter {
+    Parameter::new(name, description, || json!({ "type": "integer", "minimum": 0 }))
+}
+
+/// A revision of the map.
+pub(in crate::serve) const fn revision(name: &'static str, description: &'static str) -> Parameter {
     Parameter::new(name, description, || json!({ "type": "integer", "format": "int64", "minimum": 0 }))
 }
 
@@ -101,11 +109,11 @@ pub(in crate::serve) const DATETIME: Parameter = Parameter::new(
      with it. RFC 3339: 2026-01-31T08:00:00Z, or start/end, where .. or nothing leaves an end open.",
     || json!({ "type": "string", "format": "rfc3339-instant-or-interval" }),
 );
-pub(in crate::serve) const CURSOR: Parameter = Parameter::new(
-    "cursor",
-    "Where a page begins: from the link `next` of the page before, and from nowhere else.",
-    || json!({ "type": "string", "format": "lanemap-cursor" }),
-);
+const PAGE: &str = "Where a page begins: from the link `next` of the page before, and from nowhere else.";
+pub(in crate::serve) const MAP_CURSOR: Parameter =
+    Parameter::new("cursor", PAGE, || json!({ "type": "string", "format": "lanemap-map-cursor" }));
+pub(in crate::serve) const DRIVES_CURSOR: Parameter =
+    Parameter::new("cursor", PAGE, || json!({ "type": "string", "format": "lanemap-drives-cursor" }));
 pub(in crate::serve) const CRS: Parameter = Parameter::new(
     "crs",
     "wgs84: longitude and latitude, degrees; local: metres in the drive's own frame.",

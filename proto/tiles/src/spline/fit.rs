@@ -19,9 +19,9 @@ use super::{
 /// Greatest distance between the line and the curve, metres: with room for what lies between the points that are looked at.
 const MOST_OFF_M: f64 = 0.0095;
 /// Distance between those points, metres, at most.
-const SAMPLE_M: f64 = 0.75;
+const SAMPLE_M: f64 = 0.4;
 /// Greatest distance between the line and chords of those points, metres.
-const CHORD_M: f64 = 0.003;
+const CHORD_M: f64 = 0.001;
 /// Longest step to the end of a line, metres.
 const LONGEST_TO_END_M: f64 = 35.0;
 /// Steps that are tried from the first control point, metres; the short ones also where the line turns back on itself.

@@ -107,6 +107,15 @@ proptest! {
 }
 
 #[test]
+fn a_curve_that_swings_out_between_control_points_stays_within_a_centimetre_too() {
+    let asides_m = [0.0736, -0.0953, -0.0442, -0.0912, 0.0327, 0.0694, 0.0867];
+    let lane = lane(5, 1_471.028, &asides_m);
+    let read = read(&whole_tile(&map(vec![lane.clone()]))).unwrap();
+    let farthest_m = farthest_m(&lane, &read[0].lines[0]);
+    assert!(farthest_m <= 0.01, "{farthest_m}");
+}
+
+#[test]
 fn all_that_is_told_of_a_line_comes_back() {
     let place =
         v1::GeodeticPosition { latitude_deg: 48.123_456_789_4, longitude_deg: 11.567_890_123_4, height_m: 512.345_4 };

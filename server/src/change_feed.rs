@@ -7,6 +7,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use lanemap_core::fleet::CellId;
 use lanemap_proto::v1;
 use tokio::{
     sync::{Semaphore, mpsc},
@@ -20,6 +21,7 @@ use crate::{
     config::ServerConfig,
     fuse::{
         MapRevision, SharedMap,
+        events::CellEvent,
         follow::{FollowError, Followed, Follower, Followers, Position, Told},
         publications::CellChange,
     },
@@ -46,6 +48,8 @@ pub(crate) struct Wanted {
 pub(crate) enum Message {
     /// The first one: from here on all is told.
     Started(Position),
+    /// Something happened in a cell; the change of the cell follows.
+    Happened { cell: CellId, event: Box<CellEvent> },
     /// A cell changed.
     Cell {
         change: CellChange,
@@ -60,7 +64,7 @@ pub(crate) enum Message {
     Alive(Position),
 }
 
-/// Gives readers their feeds. Clones share the places.
+/// Gives readers their feeds; how a message is written is theirs, and what they leave out is `None`. Clones share the places.
 #[derive(Clone, Debug)]
 pub struct ChangeFeeds {
     followers: Followers,
@@ -96,7 +100,7 @@ impl ChangeFeeds {
         &self,
         peer: Peer,
         wanted: Wanted,
-        encode: impl Fn(Message) -> T + Send + Sync + 'static,
+        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
     ) -> Result<ReceiverStream<T>, FollowError> {
         let follower = self.followers.follow(wanted.from, wanted.followed)?;
         Ok(self.begin(peer, follower, wanted.lines, Vec::new(), encode))
@@ -110,7 +114,7 @@ impl ChangeFeeds {
         &self,
         peer: Peer,
         wanted: Wanted,
-        encode: impl Fn(Message) -> T + Send + Sync + 'static,
+        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
     ) -> Result<ReceiverStream<T>, FollowError> {
         match self.followers.follow(wanted.from, wanted.followed.clone()) {
             Ok(follower) => Ok(self.begin(peer, follower, wanted.lines, Vec::new(), encode)),
@@ -129,7 +133,7 @@ impl ChangeFeeds {
         follower: Follower,
         lines: bool,
         first: Vec<Message>,
-        encode: impl Fn(Message) -> T + Send + Sync + 'static,
+        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
     ) -> ReceiverStream<T> {
         let (taken, messages) = mpsc::channel(1);
         let feed = Feed { feeds: self.clone(), follower, lines, encode: Arc::new(encode), taken };
@@ -154,7 +158,7 @@ struct Feed<T, E> {
     taken: mpsc::Sender<T>,
 }
 
-impl<T: Send + 'static, E: Fn(Message) -> T + Send + Sync + 'static> Feed<T, E> {
+impl<T: Send + 'static, E: Fn(Message) -> Option<T> + Send + Sync + 'static> Feed<T, E> {
     /// Tells until the reader is gone, and why it is.
     async fn run(mut self, first: Vec<Message>) -> &'static str {
         let started = Message::Started(self.follower.position());
@@ -174,7 +178,15 @@ impl<T: Send + 'static, E: Fn(Message) -> T + Send + Sync + 'static> Feed<T, E> 
                 None => (self.encode)(Message::Alive(self.follower.position())),
                 Some(Told::Reset { newest, oldest }) => (self.encode)(Message::Reset { newest, oldest }),
                 Some(Told::Cell { change, position }) => match self.cell(change, position).await {
-                    Ok(message) => message,
+                    Ok((happened, message)) => {
+                        for event in happened {
+                            let event = Message::Happened { cell: change.cell, event: Box::new(event) };
+                            if let Err(why) = self.hand_over((self.encode)(event)).await {
+                                return why;
+                            }
+                        }
+                        message
+                    }
                     Err(error) => {
                         tracing::warn!(%error, "a change cannot be read; its reader is to come again");
                         return "a change cannot be read";
@@ -187,7 +199,8 @@ impl<T: Send + 'static, E: Fn(Message) -> T + Send + Sync + 'static> Feed<T, E> 
         }
     }
 
-    async fn hand_over(&self, message: T) -> Result<(), &'static str> {
+    async fn hand_over(&self, message: Option<T>) -> Result<(), &'static str> {
+        let Some(message) = message else { return Ok(()) };
         match timeout(self.feeds.heartbeat * MISSED_SIGNS, self.taken.send(message)).await {
             Ok(Ok(())) => Ok(()),
             Ok(Err(_)) => Err("it closed the stream"),
@@ -195,19 +208,16 @@ impl<T: Send + 'static, E: Fn(Message) -> T + Send + Sync + 'static> Feed<T, E> 
         }
     }
 
-    /// The message of a changed cell, made beside the runtime where it has lines.
-    async fn cell(&self, change: CellChange, position: Position) -> Result<T, JournalError> {
-        let told = |lines| Message::Cell { change, position, lines };
-        if !self.lines {
-            return Ok((self.encode)(told(None)));
-        }
-        let closed = |_| JournalError::Closed;
-        let _place = self.feeds.reading.acquire().await.map_err(closed)?;
-        let (map, encode) = (self.feeds.followers.map().clone(), Arc::clone(&self.encode));
+    /// What happened in a changed cell, and its message, made beside the runtime.
+    async fn cell(&self, change: CellChange, position: Position) -> Result<(Vec<CellEvent>, Option<T>), JournalError> {
+        let _place = self.feeds.reading.acquire().await.map_err(|_| JournalError::Closed)?;
+        let (map, encode, with_lines) = (self.feeds.followers.map().clone(), Arc::clone(&self.encode), self.lines);
         let CellChange { cell, from_version, to_version, .. } = change;
         let reading = tokio::task::spawn_blocking(move || {
-            let lines = map.changes_between(cell, from_version, to_version)?;
-            Ok(encode(Message::Cell { change, position, lines }))
+            let mut happened = map.events(cell)?;
+            happened.retain(|event| event.version > from_version && event.version <= to_version);
+            let lines = if with_lines { map.changes_between(cell, from_version, to_version)? } else { None };
+            Ok((happened, encode(Message::Cell { change, position, lines })))
         });
         reading.await.map_err(|error| JournalError::Store(error.to_string()))?
     }

@@ -14,7 +14,9 @@
 mod bases;
 pub(crate) mod border;
 mod cell_record;
+pub mod events;
 pub mod follow;
+mod lineage;
 pub(crate) mod offer;
 pub mod publications;
 mod queue;

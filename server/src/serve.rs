@@ -22,6 +22,7 @@
 //! | `/timeline` | when the map changed: revisions to go back to; `steps` |
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
+//! | `/cells/{id}/events` | what happened to its road, and to the names of its lines: `since`, `limit` |
 //! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
 //! | `/exports/{id}` | a cell for other programs: GeoJSON, FlatGeobuf, PMTiles, Lanelet2, OpenDRIVE; `format`, or a suffix |
 //! | `/styles/lanes.json` | a MapLibre style that draws them as paint |
@@ -38,6 +39,7 @@ mod difference;
 mod drive_items;
 mod encoding;
 pub mod entity_tag;
+mod events;
 mod exports;
 pub mod extents;
 pub mod features;
@@ -213,6 +215,7 @@ fn for_readers() -> Routes {
         .get("/cells/{id}/lanes.pb", cells::lanes_protobuf, operations::cell_lanes_protobuf())
         .get("/cells/{id}/changes", cells::changes_json, operations::cell_changes_json())
         .get("/cells/{id}/changes.pb", cells::changes_protobuf, operations::cell_changes_protobuf())
+        .get("/cells/{id}/events", events::events, operations::cell_events())
         .get("/cells/{id}/lanes/{lane}/history", lane_history::history, operations::lane_history())
         .get("/changes", changes::changes, operations::changes())
         .get("/differences", difference::differences, operations::differences())

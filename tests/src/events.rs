@@ -65,11 +65,15 @@ impl Events {
         }
     }
 
-    /// The next event, which is of this type.
+    /// The next event, which is of this type; what happened to the road is passed over where it is not asked for.
     pub async fn expect(&mut self, name: &str) -> Event {
-        let event = self.next().await.expect("the stream goes on");
-        assert_eq!(event.name, name, "{event:?}");
-        event
+        loop {
+            let event = self.next().await.expect("the stream goes on");
+            if event.name == name {
+                return event;
+            }
+            assert_eq!(event.name, "change", "{event:?}");
+        }
     }
 
     /// Waits for a comment.

@@ -7,7 +7,10 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use lanemap_core::fleet::CellId;
 use lanemap_proto::{
-    v1::{self, map_service_client::MapServiceClient, watch_changes_response::Told},
+    v1::{
+        self, admin_service_client::AdminServiceClient, map_service_client::MapServiceClient,
+        watch_changes_response::Told,
+    },
     zenoh_keys::{CELL_ENCODING, EVERY_CELL, cell_key},
 };
 use lanemap_server::{
@@ -18,7 +21,7 @@ use lanemap_server::{
 use lanemap_tests::{
     endpoints::HeldEndpoint,
     events::{Event, Events},
-    fleets::{PATIENCE, WireDrive, along_a_road, cell_bytes, cells_until, settled},
+    fleets::{FLEET, PATIENCE, WireDrive, along_a_road, cell_bytes, cells_until, settled},
     http, raw_zenoh,
     servers::{self, ServerProcess},
 };
@@ -479,5 +482,89 @@ async fn over_zenoh_every_cell_is_put_as_it_changes_and_queried_as_it_is() {
     let (key, bytes) = fresh.first_key_value().unwrap();
     assert_eq!(queried(&session, key).await, BTreeMap::from([(key.clone(), bytes.clone())]));
     assert!(queried(&session, "lanemap/v1/map/14-1-1").await.is_empty());
+    server.shutdown().await;
+}
+
+/// Features of `/cells/{id}/events` of all cells.
+async fn events_of(url: &str) -> Vec<Value> {
+    let mut events = Vec::new();
+    for cell in cell_bytes(url).await.into_keys() {
+        let page = http::get(format!("{url}/cells/{cell}/events")).await.unwrap().error_for_status().unwrap();
+        let page: Value = page.json().await.unwrap();
+        events.extend(page["features"].as_array().unwrap().clone());
+    }
+    events
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_line_that_an_older_drive_renames_is_told_by_both_names_and_a_deletion_takes_them_out() {
+    let drives = along_a_road(32, 2, 200.0, false);
+    let folder = tempfile::tempdir().unwrap();
+    let server = lively(folder.path(), |_| ()).await;
+    let url = server.url();
+    drives[1].upload_whole(&url).await;
+    settled(&server).await;
+    let mut events = Events::open(&format!("{url}/changes"), "").await;
+    let since = events.expect("start").await.data["revision"].clone();
+    drives[0].upload_whole(&url).await;
+    settled(&server).await;
+    let renamed = |event: &Value| event["properties"]["kind"] == "renamed" || event["properties"]["kind"] == "merged";
+    let told = events_of(&url).await;
+    let told: Vec<&Value> = told.iter().filter(|event| renamed(event)).collect();
+    assert!(!told.is_empty(), "the older drive gives the lines their names");
+    let lanes: Vec<String> =
+        Copy::of(&url).await.cells.into_values().flat_map(|cell| cell.lanes).map(|lane| lane.id).collect();
+    for event in &told {
+        let properties = &event["properties"];
+        assert!(properties["revision"].as_u64() > since.as_u64(), "{event}");
+        assert!(!lanes.contains(&properties["lane"].as_str().unwrap().to_owned()), "{event}");
+        assert!(properties["into"][0].is_string(), "{event}");
+    }
+    // The stream tells of each before the change of the cell.
+    let mut told = Vec::new();
+    while events.last_id != server.map().revision().to_string() {
+        told.push(timeout(PATIENCE, events.next()).await.unwrap().expect("the stream goes on"));
+    }
+    let change = told.iter().position(|event| event.name == "change").expect("it is told");
+    assert!(change + 1 < told.len() && told[change].data["type"] == "Feature", "{told:?}");
+
+    let mut client = AdminServiceClient::connect(url.clone()).await.unwrap();
+    let vehicle_id = drives[1].start.vehicle_id.clone();
+    let request = v1::ForgetRequest { fleet_id: FLEET.to_owned(), vehicle_id, drive_id: None };
+    client.forget(request).await.unwrap();
+    assert_eq!(events_of(&url).await.iter().filter(|event| renamed(event)).count(), 0);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_line_that_later_drives_see_no_more_is_told_as_vanished_where_it_was() {
+    let mut drives = along_a_road(33, 8, 200.0, false);
+    // From the fifth drive on the leftmost line is gone.
+    for drive in &mut drives[4..] {
+        for frame in &mut drive.frames {
+            let left_m = |line: &v1::Detection| line.xyz.get(1).copied().unwrap_or(0.0);
+            let leftmost = frame.detections.iter().map(left_m).fold(f64::MIN, f64::max);
+            frame.detections.retain(|line| left_m(line) < leftmost - 1.0);
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let server = lively(folder.path(), |_| ()).await;
+    let url = server.url();
+    for drive in &drives {
+        drive.upload_whole(&url).await;
+    }
+    settled(&server).await;
+    let events = events_of(&url).await;
+    let vanished: Vec<&Value> = events
+        .iter()
+        .filter(|event| event["properties"]["kind"] == "vanished" && event["properties"]["withdrawn"] == false)
+        .collect();
+    assert!(!vanished.is_empty(), "{events:?}");
+    for event in vanished {
+        assert_eq!(event["geometry"]["type"], "LineString");
+        assert!(event["geometry"]["coordinates"].as_array().unwrap().len() > 1);
+        let properties = &event["properties"];
+        assert!(properties["probability"].as_f64().unwrap() > 0.5 && properties["noticed"].is_string(), "{event}");
+    }
     server.shutdown().await;
 }

@@ -20,6 +20,7 @@ use tokio::sync::watch;
 
 use super::{
     CellRecord, CellVersion,
+    events::CellEvent,
     publications::{CellChange, MapChanges, MapRevision, Publication, Publications, RevisionError},
     wire::{changes, empty_cell},
 };
@@ -410,6 +411,14 @@ impl SharedMap {
             Some(before) => changes(&before.map, &after.map),
             None => changes(&empty_cell(cell), &after.map),
         }))
+    }
+
+    /// What happened in a cell, as far as it is kept, in the order of its numbers. Reads the store.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn events(&self, cell: CellId) -> Result<Vec<CellEvent>, JournalError> {
+        self.shared.store.load_full().ok_or(JournalError::Closed)?.events(cell)
     }
 
     /// The turn to publish; waits while another thread has it.

@@ -141,7 +141,7 @@ fn border(join: &Join) -> v1::LaneBorder {
     v1::LaneBorder { place: Some(place(&join.place)), continues_in: join.continues_in.map(name) }
 }
 
-fn steps_mm(points: impl Iterator<Item = Point3<f64>>) -> Vec<i32> {
+pub(super) fn steps_mm(points: impl Iterator<Item = Point3<f64>>) -> Vec<i32> {
     let mut before = [0_i32; 3];
     let mut steps = Vec::new();
     for point in points {

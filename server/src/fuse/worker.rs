@@ -14,6 +14,7 @@ use super::{
     CellRecord, CellVersion, Fuser, Offer,
     border::{self, Crossing, Piece},
     cell_record::fingerprint,
+    events::{self, CellEvent},
     now_ms,
     publications::Publication,
     queue::{Taken, Task, Wanted},
@@ -58,6 +59,9 @@ struct Fused {
 /// What of a cell is replaced.
 struct Past {
     map: Arc<v1::CellMap>,
+    /// Events that were kept, and those that are told now.
+    known: Vec<CellEvent>,
+    told: Vec<CellEvent>,
     /// Contributions that are no longer kept.
     dropped: Vec<SessionId>,
     /// A drive in it was deleted.
@@ -226,7 +230,18 @@ impl Worker {
             record.tell(fused, &facts);
         }
         let published = map.get(cell)?.map(|published| Arc::clone(&published.map));
-        let is_same = published.as_ref().is_some_and(|published| published.lanes == lanes);
+        let known: Vec<CellEvent> = if fused.is_some() || purged { self.store.events(cell)? } else { Vec::new() };
+        let told = fused.as_ref().map(|fused| {
+            let earlier = published.as_ref().map(|published| published.lanes.as_slice()).unwrap_or_default();
+            if purged {
+                // What is told of the past may name the drive that was deleted.
+                events::told(cell, &[], &fused.map, &[], &[])
+            } else {
+                events::told(cell, &known, &fused.map, earlier, &lanes)
+            }
+        });
+        let told = told.unwrap_or_default();
+        let is_same = told.is_empty() && published.as_ref().is_some_and(|published| published.lanes == lanes);
         let next = (!is_same).then(|| {
             record.version = CellVersion(before.version.0 + 1);
             let next = v1::CellMap { version: record.version.0, lanes, ..wire::empty_cell(cell) };
@@ -235,7 +250,7 @@ impl Worker {
         });
         if fused.is_some() || next.is_some() || purged {
             let published = published.unwrap_or_else(|| Arc::new(wire::empty_cell(cell)));
-            let past = Past { map: published, dropped, purged };
+            let past = Past { map: published, known, told, dropped, purged };
             self.write(cell, record.clone(), fused.as_ref(), next, past)?;
         }
         self.tell_neighbours(cell, &before.crossings, &record.crossings);
@@ -251,7 +266,7 @@ impl Worker {
         next: Option<(v1::CellMap, Vec<u8>)>,
         past: Past,
     ) -> Result<(), JournalError> {
-        let Past { map: before, dropped, purged } = past;
+        let Past { map: before, known, told, dropped, purged } = past;
         let outdated = self.outdated(cell, next.is_some(), purged)?;
         let published_ms = now_ms();
         let map = &self.fuser.shared.map;
@@ -275,6 +290,12 @@ impl Worker {
                 publication: encoded("a publication", &publication)?,
             })
         });
+        let told = publication.map(|Publication { revision, to_version, .. }| {
+            events::number(told, &known, revision, to_version, published_ms)
+        });
+        let told = told.unwrap_or_default();
+        let outdated_events = events::outdated(&known, &told, purged);
+        let told = told.iter().map(|event| Ok((event.number, encoded("an event", event)?)));
         let outdated_revisions =
             if publication.is_some() { map.outdated_publications(self.oldest_kept_ms()) } else { Vec::new() };
         self.store.put_cell(CellWrite {
@@ -284,6 +305,8 @@ impl Worker {
             lines: fused.map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
             version: version.transpose()?,
             outdated,
+            outdated_events,
+            events: told.collect::<Result<_, JournalError>>()?,
             outdated_revisions: outdated_revisions.iter().map(|revision| revision.0).collect(),
             dropped,
             purged,

@@ -10,6 +10,7 @@
 //! | `cell_versions`     | cell, then version, 8 bytes big-endian | when it was published, then its bytes      |
 //! | `cell_purges`       | cell                                   | none: a drive in it was deleted            |
 //! | `publications`      | revision, 8 bytes big-endian           | which version of which cell, postcard      |
+//! | `cell_events`       | cell, then number, 8 bytes big-endian  | what happened in it, postcard              |
 //!
 //! Contributions are written without waiting for the disk: whatever a crash takes of them, the drives' snapshots and
 //! frames give again. Versions are on the disk before anybody reads them, so that none is ever given twice.
@@ -91,6 +92,10 @@ pub(crate) struct CellWrite {
     pub(crate) outdated: Vec<u64>,
     /// Revisions whose publications are no longer kept.
     pub(crate) outdated_revisions: Vec<u64>,
+    /// Events that are no longer kept, by their numbers.
+    pub(crate) outdated_events: Vec<u64>,
+    /// Events that are new or differ, by their numbers.
+    pub(crate) events: Vec<(u64, Vec<u8>)>,
     /// Contributions that are no longer kept.
     pub(crate) dropped: Vec<SessionId>,
     /// What of a deleted drive was in the versions before goes with them.
@@ -219,6 +224,12 @@ impl CellStore {
             .collect()
     }
 
+    /// The events of a cell, in the order of their numbers.
+    pub(crate) fn events<T: DeserializeOwned>(&self, cell: CellId) -> Result<Vec<T>, JournalError> {
+        let entries = self.store.get()?.cell_events.prefix(cell.to_key());
+        entries.map(|entry| decoded("an event", &entry.value()?)).collect()
+    }
+
     /// What is told of the publications that are kept, in the order of their revisions.
     pub(crate) fn publications<T: DeserializeOwned>(&self) -> Result<Vec<T>, JournalError> {
         let entries = self.store.get()?.publications.iter();
@@ -287,6 +298,12 @@ impl StoreBatch<'_> {
         for version in write.outdated {
             self.batch.remove(&self.store.cell_versions, versioned(cell, version));
         }
+        for number in write.outdated_events {
+            self.batch.remove(&self.store.cell_events, versioned(cell, number));
+        }
+        for (number, event) in write.events {
+            self.batch.insert(&self.store.cell_events, versioned(cell, number), event);
+        }
         for session in write.dropped {
             self.batch.remove(&self.store.contributions, pair(cell, session));
             self.batch.remove(&self.store.contribution_facts, pair(cell, session));
@@ -312,7 +329,7 @@ impl StoreBatch<'_> {
 }
 
 impl Store {
-    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 8] {
+    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 9] {
         [
             &self.contributions,
             &self.contribution_facts,
@@ -322,6 +339,7 @@ impl Store {
             &self.cell_versions,
             &self.cell_purges,
             &self.publications,
+            &self.cell_events,
         ]
     }
 }

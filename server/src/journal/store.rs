@@ -65,6 +65,7 @@ pub(super) struct Store {
     pub(super) cell_versions: Keyspace,
     pub(super) cell_purges: Keyspace,
     pub(super) publications: Keyspace,
+    pub(super) cell_events: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
@@ -102,6 +103,7 @@ impl Store {
             cell_versions: keyspace("cell_versions", MAX_MEMTABLE_BYTES)?,
             cell_purges: keyspace("cell_purges", MAX_SMALL_MEMTABLE_BYTES)?,
             publications: keyspace("publications", MAX_SMALL_MEMTABLE_BYTES)?,
+            cell_events: keyspace("cell_events", MAX_SMALL_MEMTABLE_BYTES)?,
             folder: folder.to_owned(),
             database,
         })

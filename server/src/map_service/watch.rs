@@ -79,12 +79,14 @@ fn within_borders(bounds: &v1::Bounds) -> Result<Followed, String> {
     Ok(Followed::Within([west, south, east, north]))
 }
 
-fn response(message: Message, most_bytes: usize) -> v1::WatchChangesResponse {
+/// `None` for what HTTP alone tells.
+fn response(message: Message, most_bytes: usize) -> Option<v1::WatchChangesResponse> {
     let (position, told) = match message {
         Message::Started(position) => {
             let (Position::At(revision) | Position::Within { since: revision, .. }) = position;
             (position, Told::Started(v1::WatchStarted { revision: revision.0 }))
         }
+        Message::Happened { .. } => return None,
         Message::Alive(position) => (position, Told::Alive(v1::WatchAlive {})),
         Message::Reset { newest, oldest } => {
             (Position::At(newest), Told::Reset(v1::WatchReset { revision: newest.0, oldest_revision: oldest.0 }))
@@ -103,7 +105,7 @@ fn response(message: Message, most_bytes: usize) -> v1::WatchChangesResponse {
             (position, Told::Cell(cell))
         }
     };
-    v1::WatchChangesResponse { position: position.to_string(), told: Some(told) }
+    Some(v1::WatchChangesResponse { position: position.to_string(), told: Some(told) })
 }
 
 #[cfg(test)]

@@ -236,7 +236,8 @@ fn no_such_cell(id: &str) -> Problem {
     Problem::NoSuchCell { cell: repeated(id) }
 }
 
-fn known(map: &SharedMap, id: &str) -> Result<(CellId, Arc<CellRecord>), Problem> {
+/// A cell that is there.
+pub(super) fn known(map: &SharedMap, id: &str) -> Result<(CellId, Arc<CellRecord>), Problem> {
     let cell = id.parse().map_err(|_| no_such_cell(id))?;
     Ok((cell, map.record(cell).ok_or_else(|| no_such_cell(id))?))
 }

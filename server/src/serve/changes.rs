@@ -4,9 +4,10 @@
 //! |---|---|---|
 //! | `start` | `revision`, up to which the reader has all | take the map as a whole, if it is not there yet |
 //! | `cell` | `cell`, `from_version`, `to_version`, `revision`, number of lines that differ | take the cell, or its changes since `from_version` |
+//! | `change` | what happened to the road, or to the names of lines: a feature of `/cells/{id}/events` | the `cell` follows |
 //! | `reset` | `revision`, and the `oldest` since which changes are known | take the map as a whole |
 //!
-//! Every event has an id with which it is the last that a reader has: `Last-Event-ID`, which browsers send by themselves, or
+//! Every event but `change` has an id with which it is the last that a reader has: `Last-Event-ID`, which browsers send by themselves, or
 //! `since` go on after it. A reader that is slow is told of each cell once. Where `from_version` is not the version
 //! that the reader has, it takes the cell as a whole, or its changes since its own version: `/cells/{id}/changes`.
 
@@ -30,6 +31,7 @@ use super::{
     ServeState,
     bounds::Bounds,
     cells::{ChangedLines, written},
+    events::feature,
     problem::{Problem, repeated},
     query::Parameters,
 };
@@ -87,7 +89,7 @@ pub(super) async fn changes(State(state): State<ServeState>, request: Request) -
     let peer = peer_of(request.extensions())?;
     let Query { wanted, comes_again } = Query::read(&request)?;
     let most_bytes = state.feeds.most_event_bytes();
-    let encode = move |message| event(message, most_bytes);
+    let encode = move |message| Some(event(message, most_bytes));
     let opened = if comes_again {
         state.feeds.open_or_reset(peer, wanted, encode)
     } else {
@@ -171,6 +173,11 @@ fn event(message: Message, most_bytes: usize) -> Event {
         Message::Alive(position) => Event::default().id(position.to_string()).comment("alive"),
         Message::Reset { newest, oldest } => {
             named("reset", Position::At(newest), &ResetData { revision: newest, oldest })
+        }
+        Message::Happened { cell, event } => {
+            let json = serde_json::to_string(&feature(cell, *event)).unwrap_or_default();
+            // The change of the cell bears the id: one that is cut off before it is told of this again.
+            Event::default().event("change").data(json)
         }
         Message::Cell { change, position, lines } => {
             let whole = lines.map(|lines| {

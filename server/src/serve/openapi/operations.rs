@@ -28,6 +28,10 @@ const FEATURE_ID: Parameter = path_id("id", "Id of a feature.");
 const SINCE: Parameter = whole_number("since", "The version that the reader has; without it, 0: nothing.");
 const REVISION: Parameter =
     revision("revision", "The map as it was at this revision, or nearly so; without it, as it is now.");
+const SINCE_REVISION: Parameter =
+    revision("since", "Events that a later revision of the map told, or withdrew; without it, all that are kept.");
+const AFTER_EVENT: Parameter =
+    whole_number("after", "The number of the event after which the page begins: from the link `next`.");
 /// Parameters of the changes of the map.
 const CHANGES: [Parameter; 4] = [
     Parameter::new(
@@ -136,6 +140,15 @@ pub(in crate::serve) fn cell_changes_protobuf() -> Operation {
     let operation = Operation::new("cellChangesAsSplines", CELLS, "The same as splines: lanemap.v1.CellChanges.");
     let operation = operation.at(CELL_ID).takes([SINCE]).answers(PROTOBUF, bytes());
     operation.refuses(410, "The version is not kept: take the cell whole.")
+}
+
+pub(in crate::serve) fn cell_events() -> Operation {
+    let operation = Operation::new("cellEvents", CELLS, "What happened to the road of a cell, and to the names of its lines.");
+    let operation = operation.describes(
+        "The newest events are kept. The link `next` leads to the next page. An event that is believed no more is told again, \
+         under its id, as withdrawn.",
+    );
+    operation.at(CELL_ID).takes([SINCE_REVISION, LIMIT, AFTER_EVENT]).answers(GEOJSON, named("CellEvents"))
 }
 
 pub(in crate::serve) fn spline_tile() -> Operation {

@@ -214,6 +214,21 @@ fn lane_history() -> Value {
     object(members, json!({}))
 }
 
+fn cell_event() -> Value {
+    let kinds = json!({
+        "type": "string", "enum": ["appeared", "vanished", "moved", "renamed", "merged", "split"],
+    });
+    let properties = json!({
+        "kind": kinds, "cell": text(), "revision": count(), "version": count(), "told_at": time(),
+        "withdrawn": { "type": "boolean" }, "lane": text(), "category": text(), "probability": probability(),
+        "drives": count(),
+    });
+    let optional = json!({ "into": list(&text()), "moved_m": number(), "noticed": time() });
+    let mut place = geometry("LineString", &line());
+    place["nullable"] = json!(true);
+    feature(&place, &object(properties, optional))
+}
+
 fn timeline() -> Value {
     let step = object(json!({ "revision": count(), "at": time(), "publications": count() }), json!({}));
     object(json!({ "oldest": count(), "newest": count(), "steps": list(&step) }), json!({}))
@@ -255,6 +270,11 @@ pub(super) fn components() -> Value {
                     "removed": list(&text()),
                 }),
                 json!({}),
+            ),
+            "CellEvent": cell_event(),
+            "CellEvents": feature_collection(
+                &named("CellEvent"),
+                json!({ "cell": text(), "numberReturned": count(), "links": links() }),
             ),
             "Differences": differences(),
             "LaneHistory": lane_history(),

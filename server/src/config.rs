@@ -147,6 +147,11 @@ pub struct ServerConfig {
     /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;
     /// of one cell at most 128.
     pub cell_versions_kept_s: u64,
+    /// Events that are kept of a cell, 1 to 10,000 of each sort: of what happened to its road, and of what became of its
+    /// lines' names.
+    pub max_events_per_cell: usize,
+    /// Time for which an event of a cell is kept, seconds, 0 to 1e10; those of a cell leave when it is fused again.
+    pub cell_events_kept_s: u64,
     /// Readers that may follow the map at a time, over HTTP and gRPC together; more are told to come again.
     pub max_change_readers: usize,
     /// Time between two signs of life to a reader that follows the map while nothing changes, seconds, at least 1. One that
@@ -246,6 +251,8 @@ impl Default for ServerConfig {
             fuse_cpu_share: 0.5,
             max_contributions_per_cell: 256,
             cell_versions_kept_s: 3600,
+            max_events_per_cell: 256,
+            cell_events_kept_s: 366 * 24 * 3600,
             max_change_readers: 1000,
             change_heartbeat_s: 15,
             max_change_event_bytes: 256 * 1024,
@@ -364,6 +371,8 @@ impl ServerConfig {
         within("fuse_cpu_share", self.fuse_cpu_share, 0.01, 1.0, "0.01 ..= 1")?;
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
         within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;
+        within("max_events_per_cell", self.max_events_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
+        within("cell_events_kept_s", self.cell_events_kept_s as f64, 0.0, 1e10, "0 ..= 1e10")?;
         within("max_change_readers", self.max_change_readers as f64, 0.0, 1e6, "0 ..= 1e6")?;
         within("change_heartbeat_s", self.change_heartbeat_s as f64, 1.0, 3600.0, "1 ..= 3600")?;
         within("max_change_event_bytes", self.max_change_event_bytes as f64, 0.0, 2_097_152.0, "0 ..= 2097152")?;

@@ -62,6 +62,8 @@ pub(crate) struct FuseSettings {
     pub(crate) cpu_share: f64,
     pub(crate) max_contributions: usize,
     pub(crate) versions_kept: Duration,
+    pub(crate) most_events: usize,
+    pub(crate) events_kept: Duration,
 }
 
 impl FuseSettings {
@@ -72,6 +74,8 @@ impl FuseSettings {
             cpu_share: config.fuse_cpu_share,
             max_contributions: config.max_contributions_per_cell,
             versions_kept: Duration::from_secs(config.cell_versions_kept_s),
+            most_events: config.max_events_per_cell,
+            events_kept: Duration::from_secs(config.cell_events_kept_s),
         }
     }
 }

@@ -9,9 +9,11 @@ use lanemap_proto::{
 };
 use lanemap_server::{RunningServer, fuse::SharedMap};
 use lanemap_simulator::{
-    FleetScenario, Seed,
-    fleet::{FleetRoutes, ReceiverModel},
+    Fleet, FleetScenario, Seed,
+    fleet::{ChangeKind, ChangePlan, FleetRoads, FleetRoutes, ReceiverModel},
+    road::{Course, SingleRoad},
 };
+use nalgebra::Point3;
 use prost::Message;
 use serde_json::Value;
 use tokio::time::{interval, timeout};
@@ -38,13 +40,53 @@ pub struct WireDrive {
 /// the border of two cells runs across the middle of the way.
 #[must_use]
 pub fn along_a_road(seed: u64, count: u32, length_m: f64, on_border: bool) -> Vec<WireDrive> {
-    let mut scenario = FleetScenario {
+    let scenario = FleetScenario {
         drives: count,
         routes: FleetRoutes::Shared { length_m, both_directions: false },
         receiver: ReceiverModel { bias_sigma_m: 1.0, ..ReceiverModel::default() },
         ..FleetScenario::straight_road()
     };
-    // Within a cell, or half way over its border.
+    wire_drives(&in_one_place(scenario, seed, on_border))
+}
+
+/// A line on the earth: longitude and latitude of its points, degrees.
+pub type Places = Vec<[f64; 2]>;
+
+/// A road that changes while vehicles drive along it.
+#[derive(Debug)]
+pub struct ChangingRoad {
+    /// The drives, every second one the other way.
+    pub drives: Vec<WireDrive>,
+    /// What changes, and where that was and is; empty where there was nothing, or is nothing.
+    pub changes: Vec<(ChangeKind, Places, Places)>,
+}
+
+/// `count` drives, a day apart, both ways along all of one straight road of 700 m, while it changes as planned.
+#[must_use]
+pub fn along_a_changing_road(seed: u64, count: u32, plan: ChangePlan) -> ChangingRoad {
+    let fleet = in_one_place(changing(count, plan), seed, false);
+    let georeference = fleet.georeference();
+    let places = |points: &[Point3<f64>]| -> Places {
+        let places = points.iter().map(|point| Georeference::to_wgs84(georeference, point));
+        places.map(|place| [place.longitude_deg, place.latitude_deg]).collect()
+    };
+    let changes = fleet.changes().iter().map(|change| (change.kind, places(&change.before), places(&change.after)));
+    ChangingRoad { changes: changes.collect(), drives: wire_drives(&fleet) }
+}
+
+fn changing(count: u32, changes: ChangePlan) -> FleetScenario {
+    FleetScenario {
+        drives: count,
+        roads: FleetRoads::Single(SingleRoad::new(Course::Straight, 700.0)),
+        routes: FleetRoutes::Shared { length_m: 650.0, both_directions: true },
+        receiver: ReceiverModel { bias_sigma_m: 1.0, ..ReceiverModel::default() },
+        changes,
+        ..FleetScenario::straight_road()
+    }
+}
+
+/// The fleet of a scenario of one road, moved into the middle of a cell, or half way over its border.
+fn in_one_place(mut scenario: FleetScenario, seed: u64, on_border: bool) -> Fleet {
     let fleet = scenario.fleet(Seed(seed));
     let drive = fleet.drive(0);
     let states = drive.states();
@@ -62,9 +104,10 @@ pub fn along_a_road(seed: u64, count: u32, length_m: f64, on_border: bool) -> Ve
     };
     scenario.anchor.longitude_deg += wanted.0 - place.longitude_deg;
     scenario.anchor.latitude_deg += wanted.1 - place.latitude_deg;
-    drop(drive);
+    scenario.fleet(Seed(seed))
+}
 
-    let fleet = scenario.fleet(Seed(seed));
+fn wire_drives(fleet: &Fleet) -> Vec<WireDrive> {
     let wire = fleet.drives().map(|drive| WireDrive {
         number: drive.number(),
         start: v1::SessionStart {

@@ -3,7 +3,10 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use lanemap_core::fleet::CellId;
 use lanemap_proto::{
@@ -18,10 +21,13 @@ use lanemap_server::{
     config::ZenohMode,
     fuse::{CellVersion, MapRevision, RevisionError, SharedMap, wire::apply},
 };
+use lanemap_simulator::fleet::{ChangeKind, ChangePlan};
 use lanemap_tests::{
     endpoints::HeldEndpoint,
     events::{Event, Events},
-    fleets::{FLEET, PATIENCE, WireDrive, along_a_road, cell_bytes, cells_until, settled},
+    fleets::{
+        ChangingRoad, FLEET, PATIENCE, WireDrive, along_a_changing_road, along_a_road, cell_bytes, cells_until, settled,
+    },
     http, raw_zenoh,
     servers::{self, ServerProcess},
 };
@@ -536,35 +542,79 @@ async fn a_line_that_an_older_drive_renames_is_told_by_both_names_and_a_deletion
     server.shutdown().await;
 }
 
+/// Metres east and north of a place, near it.
+fn metres_from(origin: [f64; 2], place: [f64; 2]) -> [f64; 2] {
+    const M_PER_DEG: f64 = 111_195.0;
+    [(place[0] - origin[0]) * M_PER_DEG * origin[1].to_radians().cos(), (place[1] - origin[1]) * M_PER_DEG]
+}
+
+/// Share of the places of one line that lie within `within_m` of a place of the other.
+fn share_near(line: &[[f64; 2]], other: &[[f64; 2]], within_m: f64) -> f64 {
+    let distance_m = |from: [f64; 2], to: [f64; 2]| metres_from(from, to).iter().fold(0.0, |sum, m| m.hypot(sum));
+    let near = |place: &&[f64; 2]| other.iter().any(|to| distance_m(**place, *to) <= within_m);
+    line.iter().filter(near).count() as f64 / line.len() as f64
+}
+
+fn places_of(event: &Value) -> Vec<[f64; 2]> {
+    let coordinates = event["geometry"]["coordinates"].as_array().expect("a line");
+    coordinates.iter().map(|place| [place[0].as_f64().unwrap(), place[1].as_f64().unwrap()]).collect()
+}
+
+/// A road on which a stretch vanishes and one appears, between the sixth drive and the seventh.
+fn changing_road() -> ChangingRoad {
+    let each = ChangePlan { vanished: 1, appeared: 1, max_length_m: 100.0, ..ChangePlan::none() };
+    along_a_changing_road(33, 12, ChangePlan { first_drive: 6, last_drive: 6, ..each })
+}
+
 #[tokio::test(flavor = "multi_thread")]
-async fn a_line_that_later_drives_see_no_more_is_told_as_vanished_where_it_was() {
-    let mut drives = along_a_road(33, 8, 200.0, false);
-    // From the fifth drive on the leftmost line is gone.
-    for drive in &mut drives[4..] {
-        for frame in &mut drive.frames {
-            let left_m = |line: &v1::Detection| line.xyz.get(1).copied().unwrap_or(0.0);
-            let leftmost = frame.detections.iter().map(left_m).fold(f64::MIN, f64::max);
-            frame.detections.retain(|line| left_m(line) < leftmost - 1.0);
-        }
-    }
+async fn what_vanishes_and_what_appears_while_vehicles_drive_is_told_where_it_did() {
+    let road = changing_road();
     let folder = tempfile::tempdir().unwrap();
     let server = lively(folder.path(), |_| ()).await;
     let url = server.url();
-    for drive in &drives {
+    for drive in &road.drives {
         drive.upload_whole(&url).await;
     }
     settled(&server).await;
     let events = events_of(&url).await;
-    let vanished: Vec<&Value> = events
-        .iter()
-        .filter(|event| event["properties"]["kind"] == "vanished" && event["properties"]["withdrawn"] == false)
-        .collect();
-    assert!(!vanished.is_empty(), "{events:?}");
-    for event in vanished {
-        assert_eq!(event["geometry"]["type"], "LineString");
-        assert!(event["geometry"]["coordinates"].as_array().unwrap().len() > 1);
+    let of_road = |event: &&Value| !event["geometry"].is_null() && event["properties"]["withdrawn"] == false;
+    let told: Vec<&Value> = events.iter().filter(of_road).collect();
+    assert_eq!(road.changes.len(), 2);
+    for (kind, before, after) in &road.changes {
+        let truth = if after.is_empty() { before } else { after };
+        let name = if *kind == ChangeKind::Vanished { "vanished" } else { "appeared" };
+        let of_kind = |event: &&&Value| event["properties"]["kind"] == name;
+        let at = told.iter().filter(of_kind).find(|event| share_near(truth, &places_of(event), 3.0) > 0.5);
+        let event = at.unwrap_or_else(|| panic!("{kind:?} is not told: {events:#?}"));
         let properties = &event["properties"];
         assert!(properties["probability"].as_f64().unwrap() > 0.5 && properties["noticed"].is_string(), "{event}");
+        // Noticed with one of the four drives that came first after it, two each way.
+        let noticed = properties["noticed"].as_str().unwrap();
+        assert!(("2025-01-07".."2025-01-11").contains(&noticed), "{noticed}");
     }
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_the_events_of_a_cell_the_newest_are_kept_and_those_that_left_are_not_told_again() {
+    let road = changing_road();
+    let folder = tempfile::tempdir().unwrap();
+    let server = lively(folder.path(), |config| config.max_events_per_cell = 1).await;
+    let url = server.url();
+    let mut told = BTreeSet::new();
+    for drive in &road.drives {
+        drive.upload_whole(&url).await;
+        settled(&server).await;
+        let events = events_of(&url).await;
+        assert!(events.iter().filter(|event| !event["geometry"].is_null()).count() <= 1, "{events:#?}");
+        told.extend(events.iter().map(|event| event["id"].as_str().unwrap().to_owned()));
+    }
+    assert!(told.len() > 1, "{told:?}");
+    // Nothing is told of a map that nobody changes, though what was told first is still believed.
+    let revision = server.map().revision();
+    server.shutdown().await;
+    let server = lively(folder.path(), |config| config.max_events_per_cell = 1).await;
+    settled(&server).await;
+    assert_eq!(server.map().revision(), revision);
     server.shutdown().await;
 }

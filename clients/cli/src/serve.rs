@@ -228,6 +228,15 @@ pub struct ServeArgs {
     /// [env: LANEMAP_CELL_VERSIONS_KEPT_S] [default: 3600]
     #[arg(long, value_name = "S")]
     cell_versions_kept_s: Option<u64>,
+    /// Events that are kept of a cell, 1 to 10,000 of each sort: of what happened to its road, and of what became of its
+    /// lines' names
+    /// [env: LANEMAP_MAX_EVENTS_PER_CELL] [default: 256]
+    #[arg(long, value_name = "N")]
+    max_events_per_cell: Option<usize>,
+    /// Time for which an event of a cell is kept, seconds, 0 to 1e10; those of a cell leave when it is fused again
+    /// [env: LANEMAP_CELL_EVENTS_KEPT_S] [default: 31622400]
+    #[arg(long, value_name = "S")]
+    cell_events_kept_s: Option<u64>,
     /// Readers that may follow the map at a time, over HTTP and gRPC together; more are told to come again
     /// [env: LANEMAP_MAX_CHANGE_READERS] [default: 1000]
     #[arg(long, value_name = "N")]
@@ -348,6 +357,8 @@ impl ServeArgs {
             fuse_cpu_share: self.fuse_cpu_share,
             max_contributions_per_cell: self.max_contributions_per_cell,
             cell_versions_kept_s: self.cell_versions_kept_s,
+            max_events_per_cell: self.max_events_per_cell,
+            cell_events_kept_s: self.cell_events_kept_s,
             max_change_readers: self.max_change_readers,
             change_heartbeat_s: self.change_heartbeat_s,
             max_change_event_bytes: self.max_change_event_bytes,

@@ -119,6 +119,10 @@ pub struct ConfigOverrides {
     pub max_contributions_per_cell: Option<usize>,
     /// See [`ServerConfig::cell_versions_kept_s`].
     pub cell_versions_kept_s: Option<u64>,
+    /// See [`ServerConfig::max_events_per_cell`].
+    pub max_events_per_cell: Option<usize>,
+    /// See [`ServerConfig::cell_events_kept_s`].
+    pub cell_events_kept_s: Option<u64>,
     /// See [`ServerConfig::max_change_readers`].
     pub max_change_readers: Option<usize>,
     /// See [`ServerConfig::change_heartbeat_s`].
@@ -209,6 +213,8 @@ impl ConfigOverrides {
         set(&mut settings.fuse_cpu_share, self.fuse_cpu_share);
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
+        set(&mut settings.max_events_per_cell, self.max_events_per_cell);
+        set(&mut settings.cell_events_kept_s, self.cell_events_kept_s);
         set(&mut settings.max_change_readers, self.max_change_readers);
         set(&mut settings.change_heartbeat_s, self.change_heartbeat_s);
         set(&mut settings.max_change_event_bytes, self.max_change_event_bytes);

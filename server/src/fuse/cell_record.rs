@@ -1,6 +1,6 @@
 //! What is told of a cell beside its lines.
 
-use lanemap_core::fleet::FleetParams;
+use lanemap_core::{TimestampNs, fleet::FleetParams};
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
@@ -41,6 +41,12 @@ pub struct CellRecord {
     pub median_lateral_sigma_m: f64,
     /// Where its lines cross its border.
     pub(crate) crossings: Vec<Crossing>,
+    /// Changes of the road that were noticed no later than this are not told any more: their events have left.
+    pub(crate) events_left: Option<TimestampNs>,
+    /// Drives of it have been let go of.
+    pub(crate) forgets: bool,
+    /// The last version that told of an event.
+    pub(crate) told_in: CellVersion,
 }
 
 /// What tells a set of contributions, and the way in which they are fused, from all others.
@@ -61,7 +67,7 @@ pub(super) fn fingerprint<'a>(facts: impl IntoIterator<Item = &'a ContributionFa
 
 #[cfg(test)]
 mod tests {
-    use lanemap_core::{TimestampNs, fleet::DriveId};
+    use lanemap_core::fleet::DriveId;
 
     use super::*;
 

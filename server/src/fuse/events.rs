@@ -1,25 +1,40 @@
 //! Events of a cell: what happened to its road, and to the names of its lines, kept with the version that told it first.
 //!
-//! Fusing gives every change of the road that is believed (`lanemap_core::fleet::change`), each time anew. One that was not
-//! believed before is an event; one that is believed no more is withdrawn, and stands there as such. What became of lines
-//! whose names went ([`super::lineage`]) are events, too. The newest [`MOST_EVENTS`] of a cell are kept. Once a drive
-//! is deleted, what was known before goes, and what is believed without it is told anew.
+//! Fusing gives every change of the road that is believed (`lanemap_core::fleet::change`), each time anew. One that is
+//! at no place of a known event ([`place`]) is an event. A known one is told again, under its number, where its stretch
+//! has become longer or shorter by [`RETOLD_M`], where what vanished or appeared turns out to have moved, and, as withdrawn,
+//! where it is believed no more. What was followed by another change at its place (a construction zone that came and went)
+//! stays as it was told, and so does everything of a cell that has let go of drives: they may have been its witnesses. What became of lines whose names
+//! went ([`super::lineage`]) are events, too.
+//!
+//! Of each of the two sorts the newest of a cell are kept, as many and as long as the settings say. What has left is not
+//! told again: a change that was noticed no later than the last one that left is passed over. Once a drive is deleted, what
+//! was known before goes, and what is believed without it is told anew.
 
-use std::collections::{BTreeMap, BTreeSet};
+mod place;
 
-use lanemap_core::fleet::{CellId, ChangeKind, FusedLaneId, FusedMap, MapChange};
+use std::collections::BTreeSet;
+
+use lanemap_core::{
+    TimestampNs,
+    fleet::{CellId, ChangeKind, FusedLaneId, FusedMap, MapChange},
+};
 use lanemap_proto::{encode, v1};
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
-use xxhash_rust::xxh3::Xxh3;
 
 use super::{
     CellVersion, MapRevision,
     lineage::{Descent, Fate, descents},
-    wire::{lane_id_text, steps_mm},
+    wire::{lane_id_text, parse_lane_id, positions, steps_mm},
 };
 
-/// Most events of a cell that are kept.
-pub(super) const MOST_EVENTS: usize = 256;
+/// Difference in length from which on a known event is told again, metres.
+const RETOLD_M: f64 = 10.0;
+/// Distance within which two stretches are the same place, metres: less than that of two lines of a road.
+const NEAR_M: f64 = 1.5;
+/// The same of a line that moved and of where it vanished or appeared: as far as lines move in one event.
+const NEAR_MOVED_M: f64 = 2.7;
 
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,14 +56,37 @@ pub enum EventKind {
     Split,
 }
 
+impl EventKind {
+    /// Whether it happened to the road, and not to names alone.
+    #[must_use]
+    pub fn is_of_road(self) -> bool {
+        matches!(self, Self::Appeared | Self::Vanished | Self::Moved { .. })
+    }
+
+    /// Its name, as readers are told it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Appeared => "appeared",
+            Self::Vanished => "vanished",
+            Self::Moved { .. } => "moved",
+            Self::Renamed => "renamed",
+            Self::Merged => "merged",
+            Self::Split => "split",
+        }
+    }
+
+    fn is_same_kind(self, other: Self) -> bool {
+        std::mem::discriminant(&self) == std::mem::discriminant(&other)
+    }
+}
+
 /// Something that happened in a cell.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CellEvent {
     /// Its number within the cell, from 1.
     pub number: u64,
-    /// The same for the same event of the road each time that it is believed.
-    identity: u64,
-    /// The revision of the map that told of it, or of its withdrawal.
+    /// The revision of the map that told of it last.
     pub revision: MapRevision,
     /// The version of the cell that did.
     pub version: CellVersion,
@@ -74,46 +112,77 @@ pub struct CellEvent {
     pub xyz_mm: Vec<i32>,
 }
 
-/// What a version tells of: events that are new or were withdrawn, without number, revision and time.
-pub(super) fn told(
-    cell: CellId,
-    known: &[CellEvent],
-    fused: &FusedMap,
-    before: &[v1::FusedLane],
-    after: &[v1::FusedLane],
-) -> Vec<CellEvent> {
-    let known_by: BTreeMap<u64, &CellEvent> =
-        known.iter().filter(|event| event.noticed_unix_ns.is_some()).map(|event| (event.identity, event)).collect();
-    let mut believed = BTreeSet::new();
-    let mut told = Vec::new();
-    for change in fused.changes.iter().filter(|change| is_of(cell, change)) {
-        let event = of_road(change, fused, before);
-        if !believed.insert(event.identity) {
-            continue;
-        }
-        match known_by.get(&event.identity) {
-            Some(known) if !known.withdrawn => {}
-            Some(known) => told.push(CellEvent { number: known.number, ..event }),
-            None => told.push(event),
-        }
+impl CellEvent {
+    /// Where: control points, cell frame, metres.
+    #[must_use]
+    pub fn points(&self) -> Vec<Point3<f64>> {
+        positions(&v1::FusedLane { xyz_mm: self.xyz_mm.clone(), ..v1::FusedLane::default() })
     }
-    let withdrawn = known_by.values().filter(|event| !event.withdrawn && !believed.contains(&event.identity));
-    told.extend(withdrawn.map(|event| CellEvent { withdrawn: true, ..(*event).clone() }));
-    told.extend(descents(before, after).into_iter().map(|descent| of_names(descent, before)));
+}
+
+/// How many events of a cell are kept, and how long.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Kept {
+    /// Most of each sort: those of the road, and those of names.
+    pub(super) most: usize,
+    /// Those told before this have left, milliseconds since the Unix epoch.
+    pub(super) since_ms: u64,
+}
+
+/// What is known of a cell, and what it was.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Known<'a> {
+    pub(super) cell: CellId,
+    /// Events that are kept.
+    pub(super) events: &'a [CellEvent],
+    /// Changes of the road that were noticed no later than this are not told any more.
+    pub(super) left: Option<TimestampNs>,
+    /// Whether drives of it have been let go of.
+    pub(super) forgets: bool,
+    /// Its lines in the version before.
+    pub(super) lanes: &'a [v1::FusedLane],
+}
+
+/// What a version tells of: events that are new or differ from what is known, without revision and time; new ones without
+/// number.
+pub(super) fn told(known: &Known<'_>, fused: &FusedMap, after: &[v1::FusedLane]) -> Vec<CellEvent> {
+    let is_left = |change: &MapChange| known.left.is_some_and(|left| change.noticed <= left);
+    let changes = fused.changes.iter().filter(|change| is_of(known.cell, change));
+    let believed: Vec<Believed<'_>> = changes.map(Believed::new).collect();
+    let of_road: Vec<Remembered<'_>> =
+        known.events.iter().filter(|event| event.kind.is_of_road()).map(Remembered::new).collect();
+    let goes_on: BTreeSet<FusedLaneId> =
+        fused.lanes.iter().map(|lane| whole(lane.id)).chain(believed.iter().map(|it| it.line)).collect();
+
+    let mut told = Vec::new();
+    for old in &of_road {
+        let same: Vec<&Believed<'_>> = believed.iter().filter(|it| it.is_told_by(old, &goes_on)).collect();
+        told.extend(match same.as_slice() {
+            [] => withdrawal(old, &believed, known.forgets),
+            [only] => retelling(old, only, known, fused),
+            [_, ..] => old.event.withdrawn.then(|| CellEvent { withdrawn: false, ..old.event.clone() }),
+        });
+    }
+    let is_new = |it: &&Believed<'_>| !is_left(it.change) && !of_road.iter().any(|old| it.is_told_by(old, &goes_on));
+    told.extend(believed.iter().filter(is_new).map(|it| it.event(known, fused)));
+    told.extend(descents(known.lanes, after).into_iter().map(|descent| of_names(descent, known.lanes)));
     told
 }
 
-/// Gives events their numbers, of new ones the newest [`MOST_EVENTS`], and the version that tells of them.
+/// Gives events their numbers, of new ones of a sort the newest, and the version that tells of them.
 pub(super) fn number(
     told: Vec<CellEvent>,
     known: &[CellEvent],
-    revision: MapRevision,
-    version: CellVersion,
-    published_ms: u64,
+    most: usize,
+    (revision, version, published_ms): (MapRevision, CellVersion, u64),
 ) -> Vec<CellEvent> {
-    let excess = told.len().saturating_sub(MOST_EVENTS);
+    let (road, names): (Vec<_>, Vec<_>) = told.into_iter().partition(|event| event.kind.is_of_road());
+    let newest = |events: Vec<CellEvent>| {
+        let excess = events.len().saturating_sub(most);
+        events.into_iter().skip(excess)
+    };
     let mut last = known.iter().map(|event| event.number).max().unwrap_or(0);
-    let numbered = told.into_iter().skip(excess).map(|event| {
+    let numbered = newest(road).chain(newest(names)).map(|event| {
         let number = if event.number > 0 {
             event.number
         } else {
@@ -125,12 +194,120 @@ pub(super) fn number(
     numbered.collect()
 }
 
-/// Numbers of the events that are kept no longer: the oldest beyond the most, and all of them once a drive was deleted.
-pub(super) fn outdated(known: &[CellEvent], told: &[CellEvent], purged: bool) -> Vec<u64> {
-    let told: BTreeSet<u64> = told.iter().map(|event| event.number).collect();
-    let kept: BTreeSet<u64> = known.iter().map(|event| event.number).filter(|number| !told.contains(number)).collect();
-    let excess = if purged { kept.len() } else { (kept.len() + told.len()).saturating_sub(MOST_EVENTS) };
-    kept.into_iter().take(excess).collect()
+/// The known events that leave: of each sort the oldest beyond the most, those told too long ago, and all of them once a
+/// drive was deleted.
+pub(super) fn outdated<'a>(known: &'a [CellEvent], told: &[CellEvent], kept: Kept, purged: bool) -> Vec<&'a CellEvent> {
+    let told_again: BTreeSet<u64> = told.iter().map(|event| event.number).collect();
+    let mut outdated = Vec::new();
+    for of_road in [true, false] {
+        let is_of_sort = |event: &&CellEvent| event.kind.is_of_road() == of_road;
+        let new = told.iter().filter(is_of_sort).count();
+        let old: Vec<&CellEvent> =
+            known.iter().filter(is_of_sort).filter(|event| !told_again.contains(&event.number)).collect();
+        let excess = (old.len() + new).saturating_sub(kept.most);
+        let leaves =
+            |(index, event): (usize, &&CellEvent)| purged || index < excess || event.published_ms < kept.since_ms;
+        outdated
+            .extend(old.iter().enumerate().filter(|(index, event)| leaves((*index, event))).map(|(_, event)| *event));
+    }
+    outdated
+}
+
+/// A change that is believed now.
+struct Believed<'a> {
+    change: &'a MapChange,
+    kind: EventKind,
+    line: FusedLaneId,
+}
+
+/// An event of the road that is known.
+struct Remembered<'a> {
+    event: &'a CellEvent,
+    line: Option<FusedLaneId>,
+    points: Vec<Point3<f64>>,
+}
+
+impl<'a> Remembered<'a> {
+    fn new(event: &'a CellEvent) -> Self {
+        Self { event, line: parse_lane_id(&event.lane).map(whole), points: event.points() }
+    }
+}
+
+impl<'a> Believed<'a> {
+    fn new(change: &'a MapChange) -> Self {
+        let kind = match change.kind {
+            ChangeKind::Appeared => EventKind::Appeared,
+            ChangeKind::Vanished => EventKind::Vanished,
+            ChangeKind::Moved { by_m } => EventKind::Moved { by_mm: thousandths(by_m) },
+        };
+        Self { change, kind, line: whole(change.lane) }
+    }
+
+    /// Whether a known event tells of it: the same thing at the same place, on the same line or on one that is gone.
+    fn is_told_by(&self, old: &Remembered<'_>, goes_on: &BTreeSet<FusedLaneId>) -> bool {
+        let is_its_line = old.line.is_none_or(|line| line == self.line || !goes_on.contains(&line));
+        let is_same_kind = old.event.kind.is_same_kind(self.kind);
+        // What vanished first may turn out to have moved.
+        let may_be_same = matches!(self.kind, EventKind::Moved { .. });
+        (is_same_kind && is_its_line && place::is_same(&self.change.points, &old.points, NEAR_M))
+            || (!is_same_kind && may_be_same && place::is_same(&self.change.points, &old.points, NEAR_MOVED_M))
+    }
+
+    fn event(&self, known: &Known<'_>, fused: &FusedMap) -> CellEvent {
+        let points = &self.change.points;
+        let middle = points[points.len() / 2];
+        let nearest = |lanes: &mut dyn Iterator<Item = (FusedLaneId, Vec<Point3<f64>>)>| {
+            let distances = lanes.map(|(id, points)| (place::distance_m(&middle, &points), id));
+            distances.min_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, id)| id)
+        };
+        let mut earlier = known.lanes.iter().filter_map(|lane| Some((parse_lane_id(&lane.id)?, positions(lane))));
+        let mut now =
+            fused.lanes.iter().map(|lane| (lane.id, lane.points.iter().map(|point| point.position).collect()));
+        let of_line = |(id, _): &(FusedLaneId, Vec<Point3<f64>>)| whole(*id) == self.line;
+        let id = match self.kind {
+            EventKind::Vanished => nearest(&mut earlier.by_ref().filter(of_line)),
+            _ => nearest(&mut now.by_ref().filter(of_line)),
+        };
+        let text = lane_id_text(&id.unwrap_or(self.change.lane));
+        let fused_lane = fused.lanes.iter().find(|lane| whole(lane.id) == self.line);
+        let earlier_lane = known.lanes.iter().find(|lane| lane.id == text);
+        CellEvent {
+            number: 0,
+            revision: MapRevision(0),
+            version: CellVersion(0),
+            published_ms: 0,
+            kind: self.kind,
+            withdrawn: false,
+            category: fused_lane
+                .map(|lane| encode::category(lane.category).into())
+                .or(earlier_lane.map(|lane| lane.category))
+                .unwrap_or_default(),
+            drives: fused_lane.map(|lane| lane.drives).or(earlier_lane.map(|lane| lane.drives)).unwrap_or_default(),
+            lane: text,
+            into: Vec::new(),
+            probability_permille: thousandths(self.change.probability),
+            noticed_unix_ns: Some(self.change.noticed.0),
+            xyz_mm: steps_mm(points.iter().copied()),
+        }
+    }
+}
+
+/// What is told of a known event that is still believed: nothing, or how it is now.
+fn retelling(old: &Remembered<'_>, now: &Believed<'_>, known: &Known<'_>, fused: &FusedMap) -> Option<CellEvent> {
+    let longer_m = place::length_m(&now.change.points) - place::length_m(&old.points);
+    let differs = !old.event.kind.is_same_kind(now.kind) || longer_m.abs() >= RETOLD_M;
+    (old.event.withdrawn || differs).then(|| CellEvent { number: old.event.number, ..now.event(known, fused) })
+}
+
+/// What is told of a known event that is not among the changes: that it is withdrawn, or nothing, where another change
+/// followed it at its place or its witnesses may have been let go of.
+fn withdrawal(old: &Remembered<'_>, believed: &[Believed<'_>], forgets: bool) -> Option<CellEvent> {
+    let followed = believed.iter().any(|later| {
+        Some(later.change.noticed.0) > old.event.noticed_unix_ns
+            && place::is_same(&later.change.points, &old.points, NEAR_MOVED_M)
+    });
+    let is_over = old.event.withdrawn || followed || forgets;
+    (!is_over).then(|| CellEvent { withdrawn: true, ..old.event.clone() })
 }
 
 /// Whether the middle of a change lies in the cell: its neighbours, which see beyond their borders, know it as well.
@@ -139,34 +316,9 @@ fn is_of(cell: CellId, change: &MapChange) -> bool {
     middle.is_some_and(|middle| cell.contains(&cell.anchor().wgs84_from_enu(middle)))
 }
 
-fn of_road(change: &MapChange, fused: &FusedMap, before: &[v1::FusedLane]) -> CellEvent {
-    let is_same_line = |id: &FusedLaneId| FusedLaneId { stretch: change.lane.stretch, ..*id } == change.lane;
-    let lane = fused.lanes.iter().find(|lane| is_same_line(&lane.id));
-    let text = lane_id_text(&change.lane);
-    let earlier = before.iter().find(|lane| lane.id == text);
-    CellEvent {
-        number: 0,
-        identity: identity(change),
-        revision: MapRevision(0),
-        version: CellVersion(0),
-        published_ms: 0,
-        kind: match change.kind {
-            ChangeKind::Appeared => EventKind::Appeared,
-            ChangeKind::Vanished => EventKind::Vanished,
-            ChangeKind::Moved { by_m } => EventKind::Moved { by_mm: thousandths(by_m) },
-        },
-        withdrawn: false,
-        category: lane
-            .map(|lane| encode::category(lane.category).into())
-            .or(earlier.map(|lane| lane.category))
-            .unwrap_or_default(),
-        drives: lane.map(|lane| lane.drives).or(earlier.map(|lane| lane.drives)).unwrap_or_default(),
-        lane: text,
-        into: Vec::new(),
-        probability_permille: thousandths(change.probability),
-        noticed_unix_ns: Some(change.noticed.0),
-        xyz_mm: steps_mm(change.points.iter().copied()),
-    }
+/// The line without its stretch, whose number shifts with what is shown of it.
+fn whole(id: FusedLaneId) -> FusedLaneId {
+    FusedLaneId { stretch: 0, ..id }
 }
 
 fn of_names(descent: Descent, before: &[v1::FusedLane]) -> CellEvent {
@@ -174,7 +326,6 @@ fn of_names(descent: Descent, before: &[v1::FusedLane]) -> CellEvent {
     let earlier = before.iter().find(|earlier| earlier.id == lane);
     CellEvent {
         number: 0,
-        identity: 0,
         revision: MapRevision(0),
         version: CellVersion(0),
         published_ms: 0,
@@ -194,24 +345,6 @@ fn of_names(descent: Descent, before: &[v1::FusedLane]) -> CellEvent {
     }
 }
 
-/// The line without its stretch, whose number shifts with what is shown of it, the kind, and the drive that noticed.
-fn identity(change: &MapChange) -> u64 {
-    let kind = match change.kind {
-        ChangeKind::Appeared => 0_u8,
-        ChangeKind::Vanished => 1,
-        ChangeKind::Moved { .. } => 2,
-    };
-    let mut hasher = Xxh3::new();
-    hasher.update(&[kind]);
-    hasher.update(&change.lane.started.0.to_le_bytes());
-    hasher.update(&change.lane.drive.0.to_le_bytes());
-    hasher.update(&change.lane.lane.0.to_le_bytes());
-    hasher.update(&change.lane.piece.to_le_bytes());
-    hasher.update(&change.noticed.0.to_le_bytes());
-    hasher.update(&change.noticed_by.0.to_le_bytes());
-    hasher.digest()
-}
-
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "not negative; the cast saturates")]
 fn thousandths(value: f64) -> u32 {
     (value * 1e3).round() as u32
@@ -220,56 +353,133 @@ fn thousandths(value: f64) -> u32 {
 #[cfg(test)]
 mod tests {
     use lanemap_core::{LaneId, TimestampNs, fleet::DriveId};
-    use nalgebra::Point3;
 
     use super::*;
 
-    fn cell() -> CellId {
-        CellId::new(8_718, 5_685).unwrap()
+    const CELL: (u32, u32) = (8_718, 5_685);
+
+    fn line(drive: u64) -> FusedLaneId {
+        FusedLaneId { started: TimestampNs(1), drive: DriveId(drive), lane: LaneId(3), piece: 0, stretch: 0 }
     }
 
-    fn change(drive: u64, east_m: f64) -> MapChange {
-        let lane =
-            FusedLaneId { started: TimestampNs(1), drive: DriveId(drive), lane: LaneId(3), piece: 0, stretch: 0 };
+    /// A change of a line of `drive` over so many knots, 3 m apart, from `east_m` on.
+    fn change(kind: ChangeKind, drive: u64, (east_m, north_m): (f64, f64), knots: i32, noticed: i64) -> MapChange {
         MapChange {
-            kind: ChangeKind::Vanished,
-            lane,
-            points: (0..5).map(|i| Point3::new(east_m + 3.0 * f64::from(i), 0.0, 0.0)).collect(),
-            noticed: TimestampNs(77),
+            kind,
+            lane: line(drive),
+            points: (0..knots).map(|i| Point3::new(east_m + 3.0 * f64::from(i), north_m, 0.0)).collect(),
+            noticed: TimestampNs(noticed),
             noticed_by: DriveId(9),
             probability: 0.9,
         }
     }
 
-    fn map(changes: Vec<MapChange>) -> FusedMap {
-        FusedMap { lanes: vec![], changes, drives: vec![], folded_drives: 0 }
+    fn vanished(drive: u64, east_m: f64, knots: i32) -> MapChange {
+        change(ChangeKind::Vanished, drive, (east_m, 0.0), knots, 77)
     }
 
-    fn numbered(told: Vec<CellEvent>, known: &[CellEvent], revision: u64) -> Vec<CellEvent> {
-        number(told, known, MapRevision(revision), CellVersion(revision), 5)
+    /// A cell that is told of one fusion after the other.
+    #[derive(Default)]
+    struct Teller {
+        events: Vec<CellEvent>,
+        left: Option<TimestampNs>,
+        forgets: bool,
+        version: u64,
+    }
+
+    impl Teller {
+        /// What is told of these changes.
+        fn tell(&mut self, changes: Vec<MapChange>) -> Vec<CellEvent> {
+            let fused = FusedMap { lanes: vec![], changes, drives: vec![], folded_drives: 0 };
+            let cell = CellId::new(CELL.0, CELL.1).unwrap();
+            let known = Known { cell, events: &self.events, left: self.left, forgets: self.forgets, lanes: &[] };
+            let told = told(&known, &fused, &[]);
+            self.version += 1;
+            let at = (MapRevision(self.version), CellVersion(self.version), self.version);
+            let told = number(told, &self.events, 256, at);
+            self.events.retain(|event| told.iter().all(|told| told.number != event.number));
+            self.events.extend(told.clone());
+            self.events.sort_by_key(|event| event.number);
+            told
+        }
+    }
+
+    fn numbers(told: &[CellEvent]) -> Vec<(u64, bool)> {
+        told.iter().map(|event| (event.number, event.withdrawn)).collect()
     }
 
     #[test]
     fn a_change_is_told_once_withdrawn_once_and_told_again_under_its_number() {
-        let fused = map(vec![change(1, 0.0)]);
-        let first = numbered(told(cell(), &[], &fused, &[], &[]), &[], 4);
-        assert_eq!((first.len(), first[0].number, first[0].revision), (1, 1, MapRevision(4)));
-        assert_eq!(told(cell(), &first, &fused, &[], &[]), []);
+        let mut teller = Teller::default();
+        let first = teller.tell(vec![vanished(1, 0.0, 5)]);
+        assert_eq!((numbers(&first), first[0].revision), (vec![(1, false)], MapRevision(1)));
+        assert_eq!(teller.tell(vec![vanished(1, 0.0, 5)]), []);
+        assert_eq!(numbers(&teller.tell(vec![])), [(1, true)]);
+        assert_eq!(teller.tell(vec![]), []);
+        let both = teller.tell(vec![vanished(1, 0.0, 5), vanished(2, 100.0, 5)]);
+        assert_eq!(numbers(&both), [(1, false), (2, false)]);
+    }
 
-        let withdrawn = numbered(told(cell(), &first, &map(vec![]), &[], &[]), &first, 5);
-        assert_eq!((withdrawn.len(), withdrawn[0].number, withdrawn[0].withdrawn), (1, 1, true));
-        assert_eq!(told(cell(), &withdrawn, &map(vec![]), &[], &[]), []);
+    #[test]
+    fn a_change_that_grows_is_told_again_under_its_number_and_one_on_a_line_beside_it_is_another() {
+        let mut teller = Teller::default();
+        teller.tell(vec![vanished(1, 0.0, 5)]);
+        assert_eq!(teller.tell(vec![vanished(1, 0.0, 7)]), [], "6 m more are no news");
+        let grown = teller.tell(vec![vanished(1, 0.0, 20)]);
+        assert_eq!((numbers(&grown), grown[0].points().len()), (vec![(1, false)], 20));
+        // The other line of a double line goes as well; the first one's is still believed.
+        let beside = change(ChangeKind::Vanished, 2, (0.0, 0.3), 20, 78);
+        assert_eq!(numbers(&teller.tell(vec![vanished(1, 0.0, 20), beside])), [(2, false)]);
+    }
 
-        let both =
-            numbered(told(cell(), &withdrawn, &map(vec![change(1, 0.0), change(2, 0.0)]), &[], &[]), &withdrawn, 6);
-        assert_eq!(
-            both.iter().map(|event| (event.number, event.withdrawn)).collect::<Vec<_>>(),
-            [(1, false), (2, false)]
-        );
+    #[test]
+    fn what_vanished_and_turns_out_to_have_moved_is_one_event() {
+        let mut teller = Teller::default();
+        teller.tell(vec![vanished(1, 0.0, 10)]);
+        let moved = teller.tell(vec![change(ChangeKind::Moved { by_m: 1.2 }, 5, (0.0, 1.2), 10, 79)]);
+        assert_eq!(numbers(&moved), [(1, false)]);
+        assert_eq!(moved[0].kind, EventKind::Moved { by_mm: 1_200 });
+    }
+
+    #[test]
+    fn a_line_that_went_and_came_again_did_both() {
+        let mut teller = Teller::default();
+        teller.tell(vec![vanished(1, 0.0, 10)]);
+        let back = teller.tell(vec![change(ChangeKind::Appeared, 1, (0.0, 0.1), 10, 99)]);
+        assert_eq!(numbers(&back), [(2, false)]);
+        assert!(teller.events.iter().all(|event| !event.withdrawn));
+    }
+
+    #[test]
+    fn what_has_left_is_not_told_again_and_a_cell_that_forgets_withdraws_nothing() {
+        let mut teller = Teller::default();
+        teller.tell(vec![vanished(1, 0.0, 10)]);
+        teller.forgets = true;
+        assert_eq!(teller.tell(vec![]), []);
+        let kept = Kept { most: 0, since_ms: 0 };
+        let left: Vec<u64> = outdated(&teller.events, &[], kept, false).iter().map(|event| event.number).collect();
+        assert_eq!(left, [1]);
+        (teller.events, teller.left) = (vec![], Some(TimestampNs(77)));
+        assert_eq!(teller.tell(vec![vanished(1, 0.0, 10)]), []);
+        let later = change(ChangeKind::Vanished, 1, (200.0, 0.0), 10, 78);
+        assert_eq!(teller.tell(vec![vanished(1, 0.0, 10), later]).len(), 1);
+    }
+
+    #[test]
+    fn names_take_no_place_from_what_happened_to_the_road() {
+        let mut teller = Teller::default();
+        let road = teller.tell(vec![vanished(1, 0.0, 10)]).remove(0);
+        let name = |number| CellEvent { number, kind: EventKind::Renamed, noticed_unix_ns: None, ..road.clone() };
+        let known: Vec<CellEvent> = std::iter::once(road.clone()).chain((2..7).map(name)).collect();
+        let kept = Kept { most: 3, since_ms: 0 };
+        let left: Vec<u64> = outdated(&known, &[name(7)], kept, false).iter().map(|event| event.number).collect();
+        assert_eq!(left, [2, 3, 4]);
+        assert_eq!(outdated(&known, &[], Kept { most: 9, since_ms: 2 }, false).len(), 6);
+        assert_eq!(outdated(&known, &[], Kept { most: 9, since_ms: 0 }, true).len(), 6);
     }
 
     #[test]
     fn a_change_beyond_the_border_is_the_neighbours_to_tell() {
-        assert_eq!(told(cell(), &[], &map(vec![change(1, 5_000.0)]), &[], &[]), []);
+        assert_eq!(Teller::default().tell(vec![vanished(1, 5_000.0, 5)]), []);
     }
 }

@@ -96,9 +96,12 @@ fn by_name(lanes: &[v1::FusedLane]) -> BTreeMap<&str, Vec<Vec<Point2<f64>>>> {
     named
 }
 
+/// A chord of a line.
+type Chord<'a> = (&'a str, [Point2<f64>; 2]);
+
 /// Chords of lines by the squares that they touch.
 struct Index<'a> {
-    squares: HashMap<(i64, i64), Vec<(&'a str, [Point2<f64>; 2])>>,
+    squares: HashMap<(i64, i64), Vec<Chord<'a>>>,
 }
 
 impl<'a> Index<'a> {

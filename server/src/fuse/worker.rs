@@ -6,7 +6,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use lanemap_core::fleet::{CellId, DriveId, FleetParams, FusedMap};
+use lanemap_core::{
+    TimestampNs,
+    fleet::{CellId, DriveId, FleetParams, FusedMap},
+};
 use lanemap_proto::v1;
 use prost::Message;
 
@@ -14,7 +17,7 @@ use super::{
     CellRecord, CellVersion, Fuser, Offer,
     border::{self, Crossing, Piece},
     cell_record::fingerprint,
-    events::{self, CellEvent},
+    events::{self, CellEvent, Kept, Known},
     now_ms,
     publications::Publication,
     queue::{Taken, Task, Wanted},
@@ -231,14 +234,14 @@ impl Worker {
         }
         let published = map.get(cell)?.map(|published| Arc::clone(&published.map));
         let known: Vec<CellEvent> = if fused.is_some() || purged { self.store.events(cell)? } else { Vec::new() };
+        record.forgets |= !dropped.is_empty();
         let told = fused.as_ref().map(|fused| {
             let earlier = published.as_ref().map(|published| published.lanes.as_slice()).unwrap_or_default();
-            if purged {
-                // What is told of the past may name the drive that was deleted.
-                events::told(cell, &[], &fused.map, &[], &[])
-            } else {
-                events::told(cell, &known, &fused.map, earlier, &lanes)
-            }
+            // What is told of the past may name the drive that was deleted.
+            let (events, earlier) = if purged { (&[][..], &[][..]) } else { (known.as_slice(), earlier) };
+            let (left, forgets) = (record.events_left, record.forgets);
+            let after = if purged { &[][..] } else { lanes.as_slice() };
+            events::told(&Known { cell, events, left, forgets, lanes: earlier }, &fused.map, after)
         });
         let told = told.unwrap_or_default();
         let is_same = told.is_empty() && published.as_ref().is_some_and(|published| published.lanes == lanes);
@@ -261,12 +264,13 @@ impl Worker {
     fn write(
         &self,
         cell: CellId,
-        record: CellRecord,
+        mut record: CellRecord,
         fused: Option<&Fused>,
         next: Option<(v1::CellMap, Vec<u8>)>,
         past: Past,
     ) -> Result<(), JournalError> {
         let Past { map: before, known, told, dropped, purged } = past;
+        let kept = self.events_kept();
         let outdated = self.outdated(cell, next.is_some(), purged)?;
         let published_ms = now_ms();
         let map = &self.fuser.shared.map;
@@ -291,10 +295,17 @@ impl Worker {
             })
         });
         let told = publication.map(|Publication { revision, to_version, .. }| {
-            events::number(told, &known, revision, to_version, published_ms)
+            events::number(told, &known, kept.most, (revision, to_version, published_ms))
         });
         let told = told.unwrap_or_default();
-        let outdated_events = events::outdated(&known, &told, purged);
+        let left = events::outdated(&known, &told, kept, purged);
+        if !purged {
+            let left = left.iter().filter_map(|event| event.noticed_unix_ns).map(TimestampNs).max();
+            record.events_left = record.events_left.max(left);
+        }
+        if !told.is_empty() {
+            record.told_in = record.version;
+        }
         let told = told.iter().map(|event| Ok((event.number, encoded("an event", event)?)));
         let outdated_revisions =
             if publication.is_some() { map.outdated_publications(self.oldest_kept_ms()) } else { Vec::new() };
@@ -305,7 +316,7 @@ impl Worker {
             lines: fused.map(|fused| encoded("a cell's lines", &fused.pieces)).transpose()?,
             version: version.transpose()?,
             outdated,
-            outdated_events,
+            outdated_events: left.iter().map(|event| event.number).collect(),
             events: told.collect::<Result<_, JournalError>>()?,
             outdated_revisions: outdated_revisions.iter().map(|revision| revision.0).collect(),
             dropped,
@@ -317,6 +328,13 @@ impl Worker {
         }
         drop(turn);
         Ok(())
+    }
+
+    /// How many events of a cell are kept, and how long.
+    fn events_kept(&self) -> Kept {
+        let settings = &self.fuser.shared.settings;
+        let kept_ms = u64::try_from(settings.events_kept.as_millis()).unwrap_or(u64::MAX);
+        Kept { most: settings.most_events, since_ms: now_ms().saturating_sub(kept_ms) }
     }
 
     /// Time before which what was replaced is kept no longer, milliseconds since the Unix epoch.

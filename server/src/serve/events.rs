@@ -6,7 +6,6 @@ use axum::{
     response::Response,
 };
 use lanemap_core::{Category, TimestampNs, fleet::CellId};
-use lanemap_proto::v1;
 use serde::Serialize;
 
 use super::{
@@ -17,18 +16,15 @@ use super::{
     in_background,
     line::{Coordinate, written},
     link_base::LinkBase,
+    ogc::{DEFAULT_FEATURES, MOST_FEATURES},
     problem::Problem,
-    query::{Parameters, parse_limit},
+    query::{Parameters, parse_limit, whole_number},
     sessions::{GEOJSON, Link},
 };
 use crate::fuse::{
     MapRevision,
     events::{CellEvent, EventKind},
-    wire::positions,
 };
-
-/// Events of a page, where the query does not say; as many as are kept of a cell.
-const MOST_EVENTS: usize = 256;
 
 /// A page of events, in the order of their numbers.
 #[derive(Serialize)]
@@ -96,8 +92,8 @@ pub(super) async fn events(
 ) -> Result<Response, Problem> {
     let parameters = Parameters::read(&uri, &["since", "limit", "after"])?;
     let since = parameters.get("since", str::parse::<MapRevision>)?.unwrap_or_default();
-    let limit = parameters.get("limit", |text| parse_limit(text, MOST_EVENTS))?.unwrap_or(MOST_EVENTS);
-    let number = |text: &str| text.parse::<u64>().map_err(|_| "it must be the number of an event".to_owned());
+    let limit = parameters.get("limit", |text| parse_limit(text, MOST_FEATURES))?.unwrap_or(DEFAULT_FEATURES);
+    let number = |text: &str| whole_number(text).ok_or_else(|| "it must be the number of an event".to_owned());
     let after = parameters.get("after", number)?.unwrap_or(0);
     let (cell, _) = known(&state.map, &id)?;
     let map = state.map.clone();
@@ -130,9 +126,10 @@ pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
     let code = u8::try_from(event.category).unwrap_or_default();
     let category = category_name(Category::from_openlane_code(code).unwrap_or_default());
     let id = format!("{cell}.event.{}", event.number);
+    let points = event.points();
     let told_at = i64::try_from(event.published_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
     let properties = EventProperties {
-        kind: kind_name(event.kind),
+        kind: event.kind.name(),
         cell: cell.to_string(),
         revision: event.revision,
         version: event.version.0,
@@ -150,19 +147,6 @@ pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
         drives: event.drives,
     };
     let anchor = cell.anchor();
-    let line = v1::FusedLane { xyz_mm: event.xyz_mm, ..v1::FusedLane::default() };
-    let coordinates: Vec<Coordinate> =
-        positions(&line).iter().map(|point| written(anchor.wgs84_from_enu(point))).collect();
+    let coordinates: Vec<Coordinate> = points.iter().map(|point| written(anchor.wgs84_from_enu(point))).collect();
     EventFeature { id, geometry: (coordinates.len() > 1).then_some(LineString { coordinates }), properties }
-}
-
-fn kind_name(kind: EventKind) -> &'static str {
-    match kind {
-        EventKind::Appeared => "appeared",
-        EventKind::Vanished => "vanished",
-        EventKind::Moved { .. } => "moved",
-        EventKind::Renamed => "renamed",
-        EventKind::Merged => "merged",
-        EventKind::Split => "split",
-    }
 }

@@ -143,7 +143,8 @@ pub(in crate::serve) fn cell_changes_protobuf() -> Operation {
 }
 
 pub(in crate::serve) fn cell_events() -> Operation {
-    let operation = Operation::new("cellEvents", CELLS, "What happened to the road of a cell, and to the names of its lines.");
+    let operation =
+        Operation::new("cellEvents", CELLS, "What happened to the road of a cell, and to the names of its lines.");
     let operation = operation.describes(
         "The newest events are kept. The link `next` leads to the next page. An event that is believed no more is told again, \
          under its id, as withdrawn.",

@@ -60,6 +60,19 @@ def cell_event(position, revision, before, after):
     return f"event: cell\nid: {position}\ndata: {json.dumps(data)}"
 
 
+def event_feature(kind, **more):
+    known = dict(
+        kind=kind, cell="14-1-2", revision=5, version=3, told_at="2026-01-01T00:00:00Z", withdrawn=False, lane="a",
+        category="white_solid", probability=0.98, noticed="2025-12-31T00:00:00Z", drives=7, **more,
+    )
+    geometry = {"type": "LineString", "coordinates": [[11.0, 48.0, 500.0], [11.1, 48.1, 501.0]]}
+    return {"type": "Feature", "id": "14-1-2.event.1", "properties": known, "geometry": geometry}
+
+
+def happened(kind):
+    return f"event: change\ndata: {json.dumps(event_feature(kind))}"
+
+
 def feature(number):
     geometry = {"type": "LineString", "coordinates": [[11.0, 48.0, 500.0], [11.1, 48.1, 501.0]]}
     return {"type": "Feature", "id": str(number), "properties": {"drives": number}, "geometry": geometry}
@@ -136,6 +149,32 @@ class Watching(unittest.TestCase):
             self.assertEqual((change.cell, change.from_version, change.to_version, watch.position), ("14-1-2", 1, 2, "3"))
             self.assertEqual((next(watch).revision, watch.position), (5, "3-5-4"))
         self.assertEqual(service.requests[0][0], "/changes?since=3&cell=14-1-2")
+
+    def test_what_happened_is_told_typed_and_the_position_waits_for_the_change_that_tells_of_it(self):
+        service = Service(self, events(cell_event("4", 4, 1, 2), happened("vanished"), cell_event("5", 5, 2, 3)))
+        with lanemap.Map(service.url).watch() as watch:
+            self.assertEqual(next(watch).to_version, 2)
+            event = next(watch)
+            self.assertIsInstance(event, lanemap.MapEvent)
+            self.assertEqual((event.kind, event.probability, event.category), ("vanished", 0.98, lanemap.Category.WHITE_SOLID))
+            self.assertEqual((event.coordinates.shape, event.into, event.moved_m, watch.position), ((2, 3), (), None, "4"))
+            self.assertEqual(next(watch).to_version, 3)
+
+    def test_events_and_the_history_of_a_line_are_read(self):
+        renamed = dict(kind="renamed", version=3, at="2026-01-01T00:00:00Z")
+        history = dict(
+            cell="14-1-2", lane="b", versions=[], events=[event_feature("moved", moved_m=0.7)],
+            came_from=[dict(renamed, lane="a")], became=[dict(renamed, kind="split", lanes=["b", "c"])],
+        )
+        service = Service(self, answer({"features": [event_feature("renamed", into=["b"])], "more": False}), answer(history))
+        map = lanemap.Map(service.url)
+        (event,) = map.events(bbox=(1, 2, 3, 4), kinds=["renamed", "split"], limit=7)
+        self.assertEqual((event.into, event.withdrawn), (("b",), False))
+        read = map.history("14-1-2", "b")
+        self.assertEqual((read.came_from[0].lanes, read.became[0].lanes, read.events[0].moved_m), (("a",), ("b", "c"), 0.7))
+        paths = [path for path, _ in service.requests]
+        self.assertEqual(paths[1], "/cells/14-1-2/lanes/b/history")
+        self.assertIn("kind=renamed", paths[0])
 
     def test_a_stream_that_breaks_is_gone_on_with_after_the_last_event_that_was_taken(self):
         service = Service(self, events(cell_event("4", 4, 1, 2)), answer({}, 503, Retry_After="0"), events(cell_event("6", 6, 2, 3)))

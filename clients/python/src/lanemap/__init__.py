@@ -4,8 +4,7 @@
 
     camera = lanemap.Sensor(lanemap.Pose(1.5, 0, 1.6), axes="vehicle")
     with lanemap.Session("http://localhost:8080", fleet="f", vehicle="v", drive="d", sensor=camera, spool="spool") as s:
-        s.send(time_ns, pose, [lane_points    "Watch",
-])  # (n, 3) arrays, metres
+        s.send(time_ns, pose, [lane_points])  # (n, 3) arrays, metres
 
 A session outlives its connection, and with a spool its process: what is not acked is sent again.
 
@@ -17,6 +16,7 @@ from ._curves import Anchor, Curve, Samples
 from ._events import Feed, Gap, LocalMap, Refusal, Summary, VehiclePose
 from ._link import Credentials
 from ._map import Cell, Feature, Map
+from ._map_events import Descent, LaneHistory, MapEvent
 from ._session import Reconnect, Session
 from ._spool import SpoolOptions, SpoolRecovery
 from ._values import Category, Detection, FieldOfView, GnssFix, Limits, Occlusion, Pose, Sensor
@@ -30,17 +30,20 @@ __all__ = [
     "Change",
     "Credentials",
     "Curve",
+    "Descent",
     "Detection",
     "Feature",
     "Feed",
     "FieldOfView",
     "Gap",
     "GnssFix",
+    "LaneHistory",
     "LanemapError",
     "Limits",
     "LocalMap",
     "Map",
     "MapError",
+    "MapEvent",
     "MapUnreachable",
     "Occlusion",
     "Pose",
@@ -58,4 +61,5 @@ __all__ = [
     "SpoolRecovery",
     "Summary",
     "VehiclePose",
+    "Watch",
 ]

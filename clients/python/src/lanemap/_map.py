@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 from ._curves import Curve, curves_of
 from ._http import Http
 from ._link import Credentials
+from ._map_events import LaneHistory, MapEvent, event_of, history_of
 from ._spline_tiles import curves_of_tile
 from ._values import Array
 from ._watch import Watch
@@ -67,8 +68,12 @@ class Map:
                 print(feature.id, feature.properties["category"])
             for curve in map.splines(bbox=(11.5, 48.1, 11.6, 48.2)):
                 print(curve.sample(step_m=0.5).wgs84)
-            for change in map.watch():
-                print(change)
+            for news in map.watch():
+                match news:
+                    case lanemap.Change():
+                        print(news.cell, "is at version", news.to_version)
+                    case lanemap.MapEvent():
+                        print(news.kind, news.lane, news.probability)
 
     Answers are kept by their entity tags, `cache_bytes` of them, and travel again only where they changed. A service that
     is busy is asked again, up to `retries` times, when it says so. Threads may share a map.
@@ -156,6 +161,24 @@ class Map:
         self._message(f"/splines/{z}/{x}/{y}", message)
         return curves_of_tile(message)
 
+    def events(
+        self,
+        *,
+        bbox: Sequence[float] | None = None,
+        since: int | None = None,
+        kinds: Iterable[str] | None = None,
+        limit: int = PAGE,
+    ) -> list[MapEvent]:
+        """What happened, the newest first, at most `limit`: in a box, told since a revision of the map, of some kinds."""
+        given = None if bbox is None else _numbers("bbox", bbox, (4, 6))
+        named = None if kinds is None else ",".join(kinds)
+        address = self._http.address("/events", bbox=given, since=since, kind=named, limit=limit)
+        return [event_of(feature) for feature in self._http.json(address)["features"]]
+
+    def history(self, cell: str, lane: str) -> LaneHistory:
+        """How a line of a cell came to be, and what it became where its name went."""
+        return history_of(self._http.json(self._http.address(f"/cells/{cell}/lanes/{lane}/history")))
+
     def watch(
         self,
         since: int | str | None = None,
@@ -165,7 +188,9 @@ class Map:
         lines: bool = False,
         silence_s: float = 60.0,
     ) -> Watch:
-        """What changes in the map, as it changes, from now on.
+        """What changes in the map (`Change`), as it changes, from now on, and what happens to the road (`MapEvent`).
+
+        An event is told before the change of the cell that tells of it.
 
         `since` is a revision of the map that one has (0: none, and every cell is told), or the `position` of another watch.
         With `lines` changes come with their lines, where these are not too large. A connection that breaks, or is silent

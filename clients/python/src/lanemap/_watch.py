@@ -8,12 +8,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeAlias
 
 import urllib3
 from urllib3.response import BaseHTTPResponse
 
 from ._http import BUSY, Http
+from ._map_events import MapEvent, event_of
 from .errors import MapError, MapUnreachable
 
 # Longest pause between two attempts to go on, seconds.
@@ -47,6 +48,9 @@ class Reset:
     revision: int
 
 
+News: TypeAlias = Change | MapEvent | Reset
+
+
 @dataclass(frozen=True)
 class _Event:
     name: str
@@ -54,7 +58,7 @@ class _Event:
 
 
 class Watch:
-    """An iterator over changes that does not end by itself; a `with` closes it. One thread iterates; any may close it.
+    """An iterator over changes, events and resets that does not end by itself; a `with` closes it. One thread iterates; any may close it.
 
     `position` is where it goes on after what it gave last: `watch(since=position)`, in another process, too.
     """
@@ -67,10 +71,10 @@ class Watch:
         self._closed = False
         self._events = self._told()
 
-    def __iter__(self) -> Iterator[Change | Reset]:
+    def __iter__(self) -> Iterator[News]:
         return self
 
-    def __next__(self) -> Change | Reset:
+    def __next__(self) -> News:
         return next(self._events)
 
     def __enter__(self) -> Watch:
@@ -88,7 +92,7 @@ class Watch:
         if response is not None:
             _shut(response)
 
-    def _told(self) -> Iterator[Change | Reset]:
+    def _told(self) -> Iterator[News]:
         while not self._closed:
             try:
                 response = self._open()
@@ -119,13 +123,12 @@ class Watch:
         self._response = response
         return response
 
-    def _read(self, response: BaseHTTPResponse) -> Iterator[Change | Reset]:
+    def _read(self, response: BaseHTTPResponse) -> Iterator[News]:
         for event in _events(response, self._moved, self._told_pause):
             self._failures = 0
-            if event.name not in ("cell", "reset"):
+            if event.name not in _NEWS:
                 continue
-            data = json.loads(event.data)
-            yield Reset(data["revision"]) if event.name == "reset" else _change(data)
+            yield _NEWS[event.name](json.loads(event.data))
 
     def _moved(self, position: str) -> None:
         self.position = position
@@ -153,6 +156,14 @@ def _change(data: dict[str, Any]) -> Change:
         upserted=data.get("upserted"),
         removed=data.get("removed"),
     )
+
+
+# What is told, by the names of events; those that a newer service may send are passed over.
+_NEWS: dict[str, Callable[[dict[str, Any]], News]] = {
+    "cell": _change,
+    "change": event_of,
+    "reset": lambda data: Reset(data["revision"]),
+}
 
 
 def _events(

@@ -2,12 +2,13 @@
 
 use std::{env, error::Error, fs, path::PathBuf};
 
-const FILES: [&str; 8] = [
+const FILES: [&str; 9] = [
     "lanemap/v1/admin_service.proto",
     "lanemap/v1/geometry.proto",
     "lanemap/v1/observation.proto",
     "lanemap/v1/lane_map.proto",
     "lanemap/v1/ingest_service.proto",
+    "lanemap/v1/map_event.proto",
     "lanemap/v1/map_service.proto",
     "lanemap/v1/shared_map.proto",
     "lanemap/v1/spline_tile.proto",

@@ -2,6 +2,7 @@
 //!
 //! The `.proto` files under `lanemap/v1` are the reference: unit, frame and range of every field stand in its comment.
 
+pub mod cell_map;
 pub mod decode;
 pub mod encode;
 pub mod lane_name;

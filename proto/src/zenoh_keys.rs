@@ -8,6 +8,7 @@
 //! | `lanemap/v1/{fleet}/{vehicle}/@alive/{nonce}` | vehicle | liveliness token of one stream |
 //! | `lanemap/v1/@server` | server | liveliness token |
 //! | `lanemap/v1/map/{cell}` | server | `CellMap`: the newest version of the cell; it answers queries, too |
+//! | `lanemap/v1/map/{cell}/events/{number}` | server | `MapEvent`: what happened in the cell; it answers queries, too |
 //!
 //! Ids are percent-encoded in keys ([`encode_id`]), so that none can hold a `/` or a wildcard.
 
@@ -27,6 +28,10 @@ pub const EVERY_ALIVE: &str = "lanemap/v1/*/*/@alive/*";
 pub const EVERY_CELL: &str = "lanemap/v1/map/*";
 /// Encoding of cells.
 pub const CELL_ENCODING: &str = "application/protobuf;lanemap.v1.CellMap";
+/// Matches every event of every cell.
+pub const EVERY_EVENT: &str = "lanemap/v1/map/*/events/*";
+/// Encoding of events.
+pub const EVENT_ENCODING: &str = "application/protobuf;lanemap.v1.MapEvent";
 /// Encoding of requests.
 pub const REQUEST_ENCODING: &str = "application/protobuf;lanemap.v1.StreamObservationsRequest";
 /// Encoding of responses.
@@ -43,6 +48,12 @@ pub fn cell_key(cell: &str) -> String {
 pub fn parse_cell_key(key: &str) -> Option<&str> {
     let cell = key.strip_prefix(PREFIX)?.strip_prefix("/map/")?;
     (!cell.is_empty() && !cell.contains(['/', '*', '$'])).then_some(cell)
+}
+
+/// The key of an event of a cell, by the cell's name and the event's number.
+#[must_use]
+pub fn event_key(cell: &str, number: u64) -> String {
+    format!("{PREFIX}/map/{cell}/events/{number}")
 }
 
 /// The keys of one vehicle.

@@ -48,8 +48,8 @@ pub(crate) struct Wanted {
 pub(crate) enum Message {
     /// The first one: from here on all is told.
     Started(Position),
-    /// Something happened in a cell; the change of the cell follows.
-    Happened { cell: CellId, event: Box<CellEvent> },
+    /// Something happened in a cell; the change of the cell follows. The position is that of the message before.
+    Happened { cell: CellId, event: Box<CellEvent>, position: Position },
     /// A cell changed.
     Cell {
         change: CellChange,
@@ -64,7 +64,7 @@ pub(crate) enum Message {
     Alive(Position),
 }
 
-/// Gives readers their feeds; how a message is written is theirs, and what they leave out is `None`. Clones share the places.
+/// Gives readers their feeds; how a message is written is theirs. Clones share the places.
 #[derive(Clone, Debug)]
 pub struct ChangeFeeds {
     followers: Followers,
@@ -100,7 +100,7 @@ impl ChangeFeeds {
         &self,
         peer: Peer,
         wanted: Wanted,
-        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
+        encode: impl Fn(Message) -> T + Send + Sync + 'static,
     ) -> Result<ReceiverStream<T>, FollowError> {
         let follower = self.followers.follow(wanted.from, wanted.followed)?;
         Ok(self.begin(peer, follower, wanted.lines, Vec::new(), encode))
@@ -114,7 +114,7 @@ impl ChangeFeeds {
         &self,
         peer: Peer,
         wanted: Wanted,
-        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
+        encode: impl Fn(Message) -> T + Send + Sync + 'static,
     ) -> Result<ReceiverStream<T>, FollowError> {
         match self.followers.follow(wanted.from, wanted.followed.clone()) {
             Ok(follower) => Ok(self.begin(peer, follower, wanted.lines, Vec::new(), encode)),
@@ -133,7 +133,7 @@ impl ChangeFeeds {
         follower: Follower,
         lines: bool,
         first: Vec<Message>,
-        encode: impl Fn(Message) -> Option<T> + Send + Sync + 'static,
+        encode: impl Fn(Message) -> T + Send + Sync + 'static,
     ) -> ReceiverStream<T> {
         let (taken, messages) = mpsc::channel(1);
         let feed = Feed { feeds: self.clone(), follower, lines, encode: Arc::new(encode), taken };
@@ -158,10 +158,11 @@ struct Feed<T, E> {
     taken: mpsc::Sender<T>,
 }
 
-impl<T: Send + 'static, E: Fn(Message) -> Option<T> + Send + Sync + 'static> Feed<T, E> {
+impl<T: Send + 'static, E: Fn(Message) -> T + Send + Sync + 'static> Feed<T, E> {
     /// Tells until the reader is gone, and why it is.
     async fn run(mut self, first: Vec<Message>) -> &'static str {
-        let started = Message::Started(self.follower.position());
+        let mut position = self.follower.position();
+        let started = Message::Started(position);
         for message in std::iter::once(started).chain(first) {
             if let Err(why) = self.hand_over((self.encode)(message)).await {
                 return why;
@@ -177,10 +178,10 @@ impl<T: Send + 'static, E: Fn(Message) -> Option<T> + Send + Sync + 'static> Fee
             let message = match told {
                 None => (self.encode)(Message::Alive(self.follower.position())),
                 Some(Told::Reset { newest, oldest }) => (self.encode)(Message::Reset { newest, oldest }),
-                Some(Told::Cell { change, position }) => match self.cell(change, position).await {
+                Some(Told::Cell { change, position: after }) => match self.cell(change, after).await {
                     Ok((happened, message)) => {
                         for event in happened {
-                            let event = Message::Happened { cell: change.cell, event: Box::new(event) };
+                            let event = Message::Happened { cell: change.cell, event: Box::new(event), position };
                             if let Err(why) = self.hand_over((self.encode)(event)).await {
                                 return why;
                             }
@@ -196,11 +197,11 @@ impl<T: Send + 'static, E: Fn(Message) -> Option<T> + Send + Sync + 'static> Fee
             if let Err(why) = self.hand_over(message).await {
                 return why;
             }
+            position = self.follower.position();
         }
     }
 
-    async fn hand_over(&self, message: Option<T>) -> Result<(), &'static str> {
-        let Some(message) = message else { return Ok(()) };
+    async fn hand_over(&self, message: T) -> Result<(), &'static str> {
         match timeout(self.feeds.heartbeat * MISSED_SIGNS, self.taken.send(message)).await {
             Ok(Ok(())) => Ok(()),
             Ok(Err(_)) => Err("it closed the stream"),
@@ -209,15 +210,12 @@ impl<T: Send + 'static, E: Fn(Message) -> Option<T> + Send + Sync + 'static> Fee
     }
 
     /// What happened in a changed cell, and its message, made beside the runtime.
-    async fn cell(&self, change: CellChange, position: Position) -> Result<(Vec<CellEvent>, Option<T>), JournalError> {
+    async fn cell(&self, change: CellChange, position: Position) -> Result<(Vec<CellEvent>, T), JournalError> {
         let _place = self.feeds.reading.acquire().await.map_err(|_| JournalError::Closed)?;
         let (map, encode, with_lines) = (self.feeds.followers.map().clone(), Arc::clone(&self.encode), self.lines);
         let CellChange { cell, from_version, to_version, .. } = change;
         let reading = tokio::task::spawn_blocking(move || {
-            // Most versions tell of none: what is known of the cell spares reading them.
-            let tells = map.record(cell).is_some_and(|record| record.told_in > from_version);
-            let mut happened = if tells { map.events(cell)? } else { Vec::new() };
-            happened.retain(|event| event.version > from_version && event.version <= to_version);
+            let happened = map.events_between(cell, from_version, to_version)?;
             let lines = if with_lines { map.changes_between(cell, from_version, to_version)? } else { None };
             Ok((happened, encode(Message::Cell { change, position, lines })))
         });

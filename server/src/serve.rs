@@ -23,6 +23,7 @@
 //! | `/cells/{id}/changes`, `/cells/{id}/changes.pb` | what changed since a version: `since` |
 //! | `/tiles/lanes`, `/tiles/lanes/{z}/{x}/{y}` | the lines of the shared map as vector tiles: TileJSON, MVT |
 //! | `/cells/{id}/events` | what happened to its road, and to the names of its lines: `since`, `limit` |
+//! | `/events` | the same of all cells, the newest first: `bbox`, `since`, `kind`, `limit` |
 //! | `/changes` | what changes, as it changes, as server-sent events: `since`, `bbox`, `cell`, `content=lines` |
 //! | `/exports/{id}` | a cell for other programs: GeoJSON, FlatGeobuf, PMTiles, Lanelet2, OpenDRIVE; `format`, or a suffix |
 //! | `/styles/lanes.json` | a MapLibre style that draws them as paint |
@@ -50,6 +51,7 @@ mod lane_history;
 mod limits;
 pub mod line;
 pub mod link_base;
+mod map_events;
 mod ogc;
 mod openapi;
 mod operation;
@@ -218,6 +220,7 @@ fn for_readers() -> Routes {
         .get("/cells/{id}/events", events::events, operations::cell_events())
         .get("/cells/{id}/lanes/{lane}/history", lane_history::history, operations::lane_history())
         .get("/changes", changes::changes, operations::changes())
+        .get("/events", map_events::events, operations::map_events())
         .get("/differences", difference::differences, operations::differences())
         .get("/timeline", timeline::timeline, operations::timeline())
         .get("/exports/{id}", exports::cell, operations::export())

@@ -119,9 +119,9 @@ export async function serve(folder, port = 0, flags = []) {
   return { url: `http://${address}`, port: Number(address.split(":")[1]), kill };
 }
 
-/** Streams the recorded drives to a server. */
-export async function replay(url, flags = []) {
-  const child = spawn(lanemap, ["replay", "--drives", drives, "--server", url, ...flags]);
+/** Streams the recorded drives of a folder to a server. */
+export async function replay(url, flags = [], from = drives) {
+  const child = spawn(lanemap, ["replay", "--drives", from, "--server", url, ...flags]);
   const said = [];
   child.stderr.on("data", (text) => said.push(text));
   const code = await new Promise((resolve) => child.once("exit", resolve));

@@ -14,7 +14,7 @@ use lanemap_proto::{
         self, admin_service_client::AdminServiceClient, map_service_client::MapServiceClient,
         watch_changes_response::Told,
     },
-    zenoh_keys::{CELL_ENCODING, EVERY_CELL, cell_key},
+    zenoh_keys::{CELL_ENCODING, EVENT_ENCODING, EVERY_CELL, EVERY_EVENT, cell_key, event_key},
 };
 use lanemap_server::{
     Server, ServerConfig,
@@ -526,6 +526,20 @@ async fn a_line_that_an_older_drive_renames_is_told_by_both_names_and_a_deletion
         assert!(!lanes.contains(&properties["lane"].as_str().unwrap().to_owned()), "{event}");
         assert!(properties["into"][0].is_string(), "{event}");
     }
+    // From the line that went its history leads to the one that has its paint, and back.
+    let (cell, lane, heir) = {
+        let known = &told[0]["properties"];
+        let text = |value: &Value| value.as_str().unwrap().to_owned();
+        (text(&known["cell"]), text(&known["lane"]), text(&known["into"][0]))
+    };
+    let history = async |lane: &str| {
+        let answer = http::get(format!("{url}/cells/{cell}/lanes/{lane}/history")).await.unwrap();
+        answer.error_for_status().unwrap().json::<Value>().await.unwrap()
+    };
+    let was = history(&lane).await;
+    assert!(was["became"].as_array().unwrap().iter().any(|descent| descent["lanes"][0] == *heir), "{was}");
+    let is = history(&heir).await;
+    assert!(is["came_from"].as_array().unwrap().iter().any(|descent| descent["lane"] == *lane), "{is}");
     // The stream tells of each before the change of the cell.
     let mut told = Vec::new();
     while events.last_id != server.map().revision().to_string() {
@@ -616,5 +630,98 @@ async fn of_the_events_of_a_cell_the_newest_are_kept_and_those_that_left_are_not
     let server = lively(folder.path(), |config| config.max_events_per_cell = 1).await;
     settled(&server).await;
     assert_eq!(server.map().revision(), revision);
+    server.shutdown().await;
+}
+
+/// What tells an event, whatever the wire.
+fn told_of(event: &v1::MapEvent) -> (String, String, u64, bool, u32) {
+    let kind = event.kind().as_str_name().trim_start_matches("MAP_EVENT_KIND_").to_lowercase();
+    let id = format!("{}.event.{}", event.cell, event.number);
+    (id, kind, event.revision, event.withdrawn, event.probability_permille)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn over_grpc_and_zenoh_the_same_happened_as_over_http() {
+    let road = changing_road();
+    let folder = tempfile::tempdir().unwrap();
+    let endpoint = HeldEndpoint::tcp();
+    let server = lively(folder.path(), |config| {
+        config.zenoh_mode = ZenohMode::Router;
+        config.zenoh_listen = endpoint.parse().unwrap();
+    })
+    .await;
+    let url = server.url();
+    let session = raw_zenoh::connect(&endpoint).await;
+    let heard = session.declare_subscriber(EVERY_EVENT).await.unwrap();
+    for drive in &road.drives {
+        drive.upload_whole(&url).await;
+    }
+    settled(&server).await;
+    let over_http: BTreeSet<_> = events_of(&url)
+        .await
+        .iter()
+        .map(|event| {
+            let known = &event["properties"];
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "thousandths")]
+            let permille = (known["probability"].as_f64().unwrap() * 1e3).round() as u32;
+            let text = |value: &Value| value.as_str().unwrap().to_owned();
+            let revision = known["revision"].as_u64().unwrap();
+            (text(&event["id"]), text(&known["kind"]), revision, known["withdrawn"] == true, permille)
+        })
+        .collect();
+    assert!(over_http.iter().any(|event| event.1 == "vanished"), "{over_http:?}");
+
+    let mut client = MapServiceClient::connect(url.clone()).await.unwrap();
+    let request = v1::WatchChangesRequest { since_revision: Some(0), ..v1::WatchChangesRequest::default() };
+    let mut messages = client.watch_changes(request).await.unwrap().into_inner();
+    let (mut over_grpc, mut position) = (BTreeSet::new(), String::new());
+    while position != server.map().revision().to_string() {
+        let message = timeout(PATIENCE, messages.message()).await.unwrap().unwrap().expect("the stream goes on");
+        if let Some(Told::Event(event)) = &message.told {
+            assert_eq!(message.position, position, "it is told again to who is cut off here");
+            over_grpc.insert(told_of(event));
+        }
+        position = message.position;
+    }
+    assert_eq!(over_grpc, over_http);
+
+    let replies = session.get(EVERY_EVENT).await.unwrap();
+    let mut over_zenoh = BTreeSet::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let sample = reply.into_result().unwrap();
+        assert_eq!(sample.encoding().to_string(), EVENT_ENCODING);
+        let event = v1::MapEvent::decode(sample.payload().to_bytes().as_ref()).unwrap();
+        assert_eq!(sample.key_expr().as_str(), event_key(&event.cell, event.number));
+        over_zenoh.insert(told_of(&event));
+    }
+    assert_eq!(over_zenoh, over_http);
+    // What was put as it happened ends with what is known now.
+    let newest = over_http.iter().max_by_key(|event| event.2).unwrap().clone();
+    let hearing = async {
+        loop {
+            let sample = heard.recv_async().await.unwrap();
+            let event = v1::MapEvent::decode(sample.payload().to_bytes().as_ref()).unwrap();
+            if told_of(&event) == newest {
+                return;
+            }
+        }
+    };
+    timeout(PATIENCE, hearing).await.expect("it is put");
+
+    // All cells at once, the newest first, in a box, of some kinds.
+    let kinds = "kind=vanished,appeared";
+    let answer = http::get(format!("{url}/events?{kinds}&limit=1")).await.unwrap().error_for_status().unwrap();
+    let page: Value = answer.json().await.unwrap();
+    let wanted: Vec<_> = over_http.iter().filter(|event| event.1 == "vanished" || event.1 == "appeared").collect();
+    assert_eq!(page["features"][0]["properties"]["revision"], wanted.iter().map(|event| event.2).max().unwrap());
+    assert_eq!(page["more"], wanted.len() > 1);
+    let [longitude, latitude] = places_of(&page["features"][0])[0];
+    for (bbox, count) in [(format!("{longitude},{latitude},{longitude},{latitude}"), 1), ("0,0,1,1".to_owned(), 0)] {
+        let answer = http::get(format!("{url}/events?{kinds}&bbox={bbox}")).await.unwrap().error_for_status().unwrap();
+        let page: Value = answer.json().await.unwrap();
+        assert!(page["numberReturned"].as_u64().unwrap() >= count && (count == 1 || page["features"] == json!([])));
+    }
+    let wrong = http::get(format!("{url}/events?kind=came")).await.unwrap();
+    assert_eq!(wrong.status(), StatusCode::BAD_REQUEST);
     server.shutdown().await;
 }

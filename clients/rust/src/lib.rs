@@ -53,6 +53,23 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! The map is followed with a copy that is the service's map, byte for byte, at every revision that it comes to:
+//!
+//! ```no_run
+//! use lanemap_client::{MapNews, MapWatch, WatchOptions};
+//! # async fn example() -> Result<(), lanemap_client::ClientError> {
+//! let mut watch = MapWatch::new("http://127.0.0.1:8080", WatchOptions::default()).await?;
+//! loop {
+//!     match watch.next().await? {
+//!         MapNews::Cell { cell, to_version, .. } => println!("{cell} is at version {to_version}"),
+//!         MapNews::Event(event) => println!("{:?} in {}: {}", event.kind(), event.cell, event.lane),
+//!         MapNews::Reset | MapNews::Disconnected { .. } => {}
+//!     }
+//!     println!("{} cells, revision {:?}", watch.copy().cells().len(), watch.copy().revision());
+//! }
+//! # }
+//! ```
 
 mod admin;
 mod backlog;
@@ -61,6 +78,8 @@ mod credentials;
 mod error;
 mod event;
 mod link;
+mod map_copy;
+mod map_watch;
 mod maps;
 mod reconnect;
 mod session;
@@ -74,6 +93,8 @@ pub use error::ClientError;
 pub use event::{Event, Events, LocalMap, VehiclePose};
 pub use lanemap_proto::v1::{Refusal, RefusalReason};
 pub use link::ConnectOptions;
+pub use map_copy::MapCopy;
+pub use map_watch::{Area, MapNews, MapWatch, WatchOptions};
 pub use maps::MapClient;
 pub use reconnect::Reconnect;
 pub use session::{IngestClient, Session, SessionSummary};

@@ -2,6 +2,7 @@
 
 import { clock } from "./bar.js";
 import { lengthOf } from "./geometry.js";
+import * as event from "./happened.js";
 import { categoryName } from "./paint.js";
 
 /** The categories in the order of their probabilities in `category_posterior`. */
@@ -16,6 +17,11 @@ const MOST_BARS = 4;
 const MOVED_M = 0.05;
 /** Entries of the story. */
 const MOST_EVENTS = 6;
+
+/** Names that are shown, the newest. */
+const MOST_NAMES = 4;
+const WAS = { renamed: "had the name", merged: "took in", split: "parted from" };
+const IS = { renamed: "has the name", merged: "is part of", split: "parted into" };
 
 const box = document.getElementById("card");
 
@@ -33,6 +39,11 @@ export class Card {
   /** The feature id of the line that is shown. */
   get id() {
     return this.#shown;
+  }
+
+  /** Whether it is shown, of a line or of what happened. */
+  get isOpen() {
+    return !box.hidden;
   }
 
   close() {
@@ -61,21 +72,60 @@ export class Card {
     return feature;
   }
 
+  /** Tells what happened to a stretch of road. */
+  tell(happened) {
+    const { cell, lane } = happened.properties;
+    // It is no line: nothing of it is drawn anew when its cell changes.
+    this.#shown = undefined;
+    box.hidden = false;
+    const facts = event.figures(happened, metres).map(([name, value]) => figure(name, value));
+    box.replaceChildren(
+      this.#header(event.title(happened)),
+      make("p", { className: "name fine" }, [make("code", { textContent: lane }), ` · cell ${cell}`]),
+      make("dl", { className: "figures" }, facts),
+      make("p", { textContent: event.says(happened) }),
+      make("div", { className: "row" }, [
+        make("button", { type: "button", textContent: "Show whole", onclick: () => this.#on.look(happened) }),
+        make("button", { type: "button", textContent: "The line's history", onclick: () => this.#on.line(`${cell}.${lane}.0`) }),
+      ]),
+    );
+    box.scrollTop = 0;
+  }
+
+  #header(title) {
+    return make("header", {}, [
+      make("h2", { textContent: title }),
+      make("button", { type: "button", className: "close", ariaLabel: "Close (Esc)", textContent: "×", onclick: this.#on.close }),
+    ]);
+  }
+
   #draw(feature, history, id) {
     const scrolled = box.hidden ? 0 : box.scrollTop;
     box.hidden = false;
     const known = feature?.properties;
     const last = history?.versions.findLast((entry) => entry.category);
-    const header = make("header", {}, [
-      make("h2", { textContent: categoryName(known?.category ?? last?.category ?? "line") }),
-      make("button", { type: "button", className: "close", ariaLabel: "Close (Esc)", textContent: "×", onclick: this.#on.close }),
-    ]);
+    const header = this.#header(categoryName(known?.category ?? last?.category ?? "line"));
     const [cell, lane, part] = id.split(".");
     const name = make("p", { className: "name fine" }, [
       make("code", { textContent: lane }), ` · cell ${cell}${part === "0" ? "" : ` · piece ${part}`}`,
     ]);
-    box.replaceChildren(header, name, ...(known ? this.#figures(feature) : [gone(last)]), ...story(history));
+    box.replaceChildren(header, name, ...(known ? this.#figures(feature) : [gone(last)]), ...this.#names(cell, history), ...story(history));
     box.scrollTop = scrolled;
+  }
+
+  /** The lines that it was, and those that it is now. */
+  #names(cell, history) {
+    const rows = [
+      ...(history?.came_from ?? []).map(({ kind, lane, at }) => [at, WAS[kind], [lane]]),
+      ...(history?.became ?? []).map(({ kind, lanes, at }) => [at, IS[kind], lanes.filter((name) => name !== history.lane)]),
+    ].filter(([, says, lanes]) => says && lanes.length > 0).slice(-MOST_NAMES).reverse();
+    if (rows.length === 0) return [];
+    const link = (lane) => make("button", {
+      type: "button", className: "lane", textContent: shortName(lane), title: lane, onclick: () => this.#on.line(`${cell}.${lane}.0`),
+    });
+    return [make("h3", { textContent: "Its names" }), make("ul", { className: "events names" }, rows.map(([at, says, lanes]) => make("li", {}, [
+      make("time", { dateTime: at, textContent: clock(Date.parse(at)) }), make("span", {}, [`${says} `, ...lanes.map(link)]),
+    ])))];
   }
 
   #figures(feature) {
@@ -129,7 +179,10 @@ function bars(posterior) {
 function story(history) {
   if (!history || history.versions.length === 0) return [];
   const { versions } = history;
-  const events = versions.flatMap((entry, index) => happened(entry, versions[index - 1], history.oldest_kept));
+  const ofRoad = history.events.filter(({ properties }) => !properties.withdrawn)
+    .map((each) => ({ at: each.properties.told_at, text: `${capital(each.properties.kind)}, ${event.sureness(each)} sure` }));
+  const events = [...versions.flatMap((entry, index) => happened(entry, versions[index - 1], history.oldest_kept)), ...ofRoad]
+    .sort((one, other) => Date.parse(one.at) - Date.parse(other.at));
   const shown = events.reverse().slice(0, MOST_EVENTS);
   const list = make("ul", { className: "events" }, shown.map(({ at, text }) => make("li", {}, [
     make("time", { dateTime: at, textContent: clock(Date.parse(at)) }), make("span", { textContent: text }),
@@ -187,6 +240,12 @@ function chart(versions) {
   const last = known.at(-1).lateral_sigma_m;
   figure.firstChild.setAttribute("aria-label", `Sigma across the line from ${metres(known[0].lateral_sigma_m)} to ${metres(last)}; upright marks where another drive saw it`);
   return [figure];
+}
+
+/** The name of a line without the start of its oldest drive, which many have in common. */
+function shortName(lane) {
+  const [, drive, ...rest] = lane.split("-");
+  return [drive.slice(0, 6), ...rest].join("-");
 }
 
 function make(name, properties = {}, children = []) {

@@ -14,7 +14,7 @@ const NONE = ["==", ["literal", 1], 0];
 
 /**
  * The layers, bottom first. `view` is what the page shows: `layer` ("paint", "change" or a measure), `lane` (the name of the
- * chosen line), `drive` (`{ local }` of the chosen drive), `latitude`, `nowS`.
+ * chosen line), `event` (the id of the chosen event), `drive` (`{ local }` of the chosen drive), `latitude`, `nowS`.
  */
 export function layersOf(view, colours) {
   const { latitude } = view;
@@ -31,7 +31,7 @@ export function layersOf(view, colours) {
     ...(alone ? roadLayers({ prefix: "drive-", source: "drive", latitude, colours: { ...colours, ribbon: colours.accent } }) : []),
     chosenLayer(view, colours),
     ...(by && !alone ? measureLayers(by, view, shared) : paintLayers({ ...road, strength: muted ? 0.25 : 1 })),
-    ...(view.layer === "change" && !alone ? changeLayers(colours, latitude) : []),
+    ...(view.layer === "change" && !alone ? [...changeLayers(colours, latitude), ...eventLayers(colours, view)] : []),
     ...(alone ? [
       ...paintLayers({ prefix: "drive-", source: "drive", latitude, colours }),
       traceLayer(colours),
@@ -43,7 +43,7 @@ export function layersOf(view, colours) {
 }
 
 /** The layers that answer a click, of those that are drawn. */
-export const isClickable = ({ id }) => /^(curb|unknown|solid|dashed|double|mixed|measure|change|asphalt)/.test(id);
+export const isClickable = ({ id }) => /^(curb|unknown|solid|dashed|double|mixed|measure|change|event|asphalt)/.test(id);
 
 function measureLayers(by, view, shown) {
   const layer = (id, sourceLayer, zooms) => ({
@@ -77,17 +77,42 @@ function chosenLayer(view, colours) {
   };
 }
 
+const KIND = ["get", "kind"];
+const colourOfKind = (colours) => ["match", KIND, "vanished", colours.vanished, "moved", colours.moved, colours.appeared];
+
+/** Where the map is another one than it was. */
 function changeLayers(colours, latitude) {
-  const kind = ["get", "kind"];
-  const colour = ["match", kind, "vanished", colours.vanished, "moved", colours.moved, colours.appeared];
   const line = (id, filter, paint) => ({
     id, type: "line", source: "changes", filter,
     layout: { "line-join": "round", "line-cap": "butt" },
-    paint: { "line-color": colour, "line-width": groundWidth(0.6, 2.6, latitude), ...paint },
+    paint: { "line-color": colourOfKind(colours), "line-width": groundWidth(0.3, 1.4, latitude), "line-opacity": 0.8, ...paint },
   });
   return [
-    line("change", ["!=", kind, "vanished"], {}),
-    line("change-gone", ["==", kind, "vanished"], { "line-dasharray": [2, 1.4] }),
+    line("change", ["!=", KIND, "vanished"], {}),
+    line("change-gone", ["==", KIND, "vanished"], { "line-dasharray": [2, 1.4] }),
+  ];
+}
+
+/** What happened to the road: the surer, the stronger. */
+function eventLayers(colours, { latitude, event }) {
+  const [colour, sure] = [colourOfKind(colours), ["interpolate", ["linear"], ["get", "probability"], 0.5, 0.35, 0.95, 1]];
+  const chosen = (yes, no) => ["case", ["==", ["get", "event"], event ?? ""], yes, no];
+  const line = (id, more, paint) => ({
+    id, type: "line", source: "events", filter: ["all", ["==", ["geometry-type"], "LineString"], ...more],
+    layout: { "line-join": "round", "line-cap": "butt" },
+    paint: { "line-color": colour, "line-opacity": sure, "line-width": groundWidth(0.8, 4, latitude), ...paint },
+  });
+  return [
+    line("event-edge", [], { "line-color": chosen(colours.chosen, colours.ground), "line-width": groundWidth(1.4, 7, latitude), "line-opacity": 0.8 }),
+    line("event", [["!=", KIND, "vanished"]], {}),
+    line("event-gone", [["==", KIND, "vanished"]], { "line-dasharray": [1.6, 0.9] }),
+    {
+      id: "event-mark", type: "circle", source: "events", maxzoom: 17, filter: ["==", ["geometry-type"], "Point"],
+      paint: {
+        "circle-radius": ["interpolate", ["linear"], ["zoom"], 12, 4, 16, 7], "circle-color": colour, "circle-opacity": sure,
+        "circle-stroke-color": chosen(colours.chosen, colours.card), "circle-stroke-width": chosen(3, 2),
+      },
+    },
   ];
 }
 

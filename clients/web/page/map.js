@@ -46,7 +46,7 @@ export class LaneMap {
             type: "vector", tiles: [`${server.address("tiles/lanes/")}{z}/{x}/{y}`],
             minzoom: TILES_FROM, maxzoom: TILES_TO,
           },
-          cells: EXACT, drive: EXACT, trace: EXACT, changes: EXACT, truth: EXACT, ruler: EXACT, vehicles: EXACT, grid: EXACT,
+          cells: EXACT, drive: EXACT, trace: EXACT, changes: EXACT, events: EXACT, truth: EXACT, ruler: EXACT, vehicles: EXACT, grid: EXACT,
         },
         layers: this.#layers,
       },
@@ -87,7 +87,7 @@ export class LaneMap {
     this.#apply(layersOf(this.#view, colours()));
   }
 
-  /** Puts features into a source: "cells", "drive", "trace", "changes", "truth", "ruler" or "vehicles". */
+  /** Puts features into a source: "cells", "drive", "trace", "changes", "events", "truth", "ruler" or "vehicles". */
   put(source, features) {
     this.map.getSource(source).setData({ type: "FeatureCollection", features });
   }

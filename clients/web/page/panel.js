@@ -1,5 +1,6 @@
 // The panel: the state of the connection, totals, layers with their legend, and drives.
 
+import { list } from "./happened.js";
 import { MEASURES, measure } from "./measures.js";
 import { LEGEND, swatch } from "./paint.js";
 import { colours } from "./theme.js";
@@ -9,7 +10,7 @@ import { colourOf } from "./vehicles.js";
 export const LAYERS = [
   { id: "paint", name: "Paint", says: "Each line as it is painted on the road" },
   ...MEASURES,
-  { id: "change", name: "Change", says: "What came, moved or went" },
+  { id: "change", name: "Change", says: "What happened to the road" },
 ];
 
 /** Drives in the list at most; more are counted. */
@@ -72,6 +73,12 @@ export class Panel {
   recolour() {
     const by = measure(this.#legend);
     element("legend").replaceChildren(by ? ramp(by) : this.#legend === "change" ? changes() : paints());
+  }
+
+  /** Lists what happened to the road; nothing where that is not the layer. */
+  happened(events, choose) {
+    element("happened").hidden = !events?.length;
+    element("happened").replaceChildren(...list(events ?? [], choose));
   }
 
   /** Shows drives, the newest first; `total` counts those of the store. */

@@ -1,11 +1,12 @@
 // The viewer: the shared map as it grows, the vehicles that find it, its past, and what each drive alone has seen.
 
 import { readAddress, saysWhere, writeAddress } from "./address.js";
+import { Around } from "./around.js";
 import { Bar, clock, elapsed } from "./bar.js";
 import { Card, metres } from "./card.js";
-import { Differences } from "./differences.js";
 import { Feed } from "./feed.js";
 import { boxOf, joinBoxes } from "./geometry.js";
+import { PATH as HAPPENED, believed, drawn } from "./happened.js";
 import { bindKeys, toggleHelp } from "./keys.js";
 import { LAYERS, Panel } from "./panel.js";
 import { Past } from "./past.js";
@@ -21,6 +22,8 @@ const element = (id) => document.getElementById(id);
 
 const said = readAddress();
 let layer = LAYERS.some(({ id }) => id === said.layer) ? said.layer : "paint";
+/** How much of the map differs from what it was. */
+let differing = { count: 0, more: false };
 /** The revision that is shown; none: the newest. */
 let revision = /^\d+$/.test(said.revision ?? "") ? Number(said.revision) : undefined;
 let wantedDrive = said.drive;
@@ -37,11 +40,21 @@ const past = new Past(server, { revision: goTo });
 const bar = new Bar();
 const panel = new Panel({ layer: chooseLayer, drive: chooseDrive, overview });
 const card = new Card(server, { close: closeCard, look: lookAtLine, line: (id) => chooseLine(id, { look: true }) });
+/** What happened to the road within the view, by its ids. */
+let events = new Map();
 const vehicles = new Vehicles((features) => map?.put("vehicles", features));
 const ruler = new Ruler((features) => map?.put("ruler", features), sayLength);
-const differences = new Differences(server, (features, more) => {
-  map?.put("changes", features);
-  if (layer === "change") sayChanges(features.length, more);
+const happened = new Around(server, () => HAPPENED, (told) => {
+  events = new Map(believed(told).map((event) => [event.id, event]));
+  map?.put("events", drawn([...events.values()]));
+  panel.happened(layer === "change" ? [...events.values()] : undefined, (event) => chooseEvent(event, { look: true }));
+  if (layer === "change") sayChanges();
+});
+/** What differs between the time of the slider and now; lines are clicked as the map's own are. */
+const differences = new Around(server, (since) => `differences?since=${since}`, ({ features, more }) => {
+  map?.put("changes", features.map((feature) => ({ ...feature, properties: { ...feature.properties, part: 0 } })));
+  differing = { count: features.length, more };
+  if (layer === "change") sayChanges();
 });
 const feed = new Feed(server, past, {
   vehicles: (totals) => (panel.totals(totals), showVehicles()),
@@ -58,7 +71,7 @@ map = await openMap();
 if (map) {
   map.show({ layer });
   showRevision();
-  map.map.on("moveend", lookAtDifferences);
+  map.map.on("moveend", lookAtChanges);
   takeTruth(server, { show: showTruth, refuse: (reason) => note(reason) });
   if (said.lane) chooseLine(said.lane, { look: !placed }).catch(() => writeAddress({ lane: undefined }));
   setInterval(() => map.show({ nowS: Math.round(Date.now() / 1000) }), 30_000);
@@ -152,7 +165,7 @@ function showCells(changed) {
     map.reloadWithin(boxes.filter((box) => map.sees(box)));
     if (card.id && changed.some(({ id }) => card.id.startsWith(`${id}.`))) card.show(card.id).catch(() => {});
   }
-  if (changed.length > 0) lookAtDifferences();
+  if (changed.length > 0) lookAtChanges();
   keepInView();
 }
 
@@ -178,17 +191,21 @@ function chooseLayer(id) {
   writeAddress({ layer: id === "paint" ? undefined : id });
 }
 
-/** Draws what differs between the time of the slider and now, where that is the layer. */
-function lookAtDifferences() {
+/** Draws what happened to the road and, where the slider is in the past, what of the map was not so then. */
+function lookAtChanges() {
   if (!map || layer !== "change") return;
-  const since = revision ?? past.oldest;
-  if (since !== undefined) differences.look(since, map.map.getBounds().toArray().flat());
+  const view = map.map.getBounds().toArray().flat();
+  happened.look(view);
+  if (revision === undefined) differences.stop();
+  else differences.look(view, revision);
 }
 
-function sayChanges(count, more) {
-  const since = revision === undefined ? past.from : past.timeOf(revision);
-  const many = more ? `More than ${count} stretches` : count === 1 ? "1 stretch" : `${count} stretches`;
-  panel.says(since === undefined ? "Nothing has changed yet" : `${many} in view since ${clock(since)}. The time slider says since when.`);
+function sayChanges() {
+  const count = (number, name) => `${number === 0 ? "No" : number} ${name}${number === 1 ? "" : "s"}`;
+  const here = `${count(events.size, "change")} of the road in view. `;
+  const since = revision === undefined ? undefined : past.timeOf(revision);
+  panel.says(here + (since === undefined ? "Go back in time to see how the map differs from what it was."
+    : `${differing.more ? "More than " : ""}${count(differing.count, "stretch").replace("stretchs", "stretches")} of the map differ from what it was at ${clock(since)}.`));
 }
 
 /* Time */
@@ -196,7 +213,7 @@ function sayChanges(count, more) {
 function showPast() {
   if (replay) return;
   bar.show(past.timeline());
-  if (revision === undefined) lookAtDifferences();
+  if (revision === undefined) lookAtChanges();
   const at = revision === undefined ? undefined : past.timeOf(revision);
   if (at !== undefined && bar.isLive) bar.goTo(at);
   else if (revision !== undefined && at === undefined) {
@@ -218,8 +235,9 @@ function goTo(wanted) {
 /** The layer of changes shows what is now, and what of it was not then; all others the map as it was. */
 function showRevision() {
   map?.goTo(layer === "change" ? undefined : revision);
-  if (layer === "change") lookAtDifferences();
-  else differences.stop();
+  if (layer === "change") return lookAtChanges();
+  differences.stop();
+  return happened.stop();
 }
 
 /* Vehicles and drives */
@@ -346,22 +364,32 @@ function nearestVehicle() {
 
 function clicked(feature, place) {
   if (ruler.active) return ruler.add(place);
+  const event = events.get(feature?.properties.event);
+  if (event) return chooseEvent(event);
   if (!feature?.properties.lane) return closeCard();
   const { cell, lane, part } = feature.properties;
   return chooseLine(`${cell}.${lane}.${part}`).catch((error) => note(`The line cannot be read: ${error.message}`));
 }
 
 async function chooseLine(id, { look = false } = {}) {
-  map?.show({ lane: id.split(".")[1] });
+  map?.show({ lane: id.split(".")[1], event: undefined });
   writeAddress({ lane: id });
   const feature = await card.show(id);
   if (card.id === undefined) closeCard();
   else if (feature && look) lookAtLine(feature);
 }
 
+/** Tells what happened to a stretch of road. */
+function chooseEvent(event, { look = false } = {}) {
+  map?.show({ lane: undefined, event: event.id });
+  writeAddress({ lane: undefined });
+  card.tell(event);
+  if (look) lookAtLine(event);
+}
+
 function closeCard() {
   card.close();
-  map?.show({ lane: undefined });
+  map?.show({ lane: undefined, event: undefined });
   writeAddress({ lane: undefined });
 }
 
@@ -428,7 +456,7 @@ async function share() {
 /** Closes what lies on top. */
 function back() {
   if (ruler.active) toggleRuler();
-  else if (card.id) closeCard();
+  else if (card.isOpen) closeCard();
   else if (replay) chooseDrive(undefined);
   else if (revision !== undefined) bar.live();
   else overview();

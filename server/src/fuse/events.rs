@@ -1,17 +1,18 @@
 //! Events of a cell: what happened to its road, and to the names of its lines, kept with the version that told it first.
 //!
-//! Fusing gives every change of the road that is believed (`lanemap_core::fleet::change`), each time anew. One that is
-//! at no place of a known event ([`place`]) is an event. A known one is told again, under its number, where its stretch
-//! has become longer or shorter by [`RETOLD_M`], where what vanished or appeared turns out to have moved, and, as withdrawn,
-//! where it is believed no more. What was followed by another change at its place (a construction zone that came and went)
-//! stays as it was told, and so does everything of a cell that has let go of drives: they may have been its witnesses. What became of lines whose names
-//! went ([`super::lineage`]) are events, too.
+//! Fusing gives every change of the road (`lanemap_core::fleet::change`), each time anew; one that is more probable than not
+//! is believed. One that is at no place of a known event ([`place`]) is an event. A known one is told again, under its
+//! number, where its stretch has become longer or shorter by [`RETOLD_M`], where what vanished or appeared turns out to have
+//! moved, and, as withdrawn, where it is believed no more. What was followed by another change at its place (a construction
+//! zone that came and went) stays as it was told, and so does everything of a cell that has let go of drives: they may have
+//! been its witnesses. What became of lines whose names went ([`super::lineage`]) are events, too.
 //!
 //! Of each of the two sorts the newest of a cell are kept, as many and as long as the settings say. What has left is not
 //! told again: a change that was noticed no later than the last one that left is passed over. Once a drive is deleted, what
 //! was known before goes, and what is believed without it is told anew.
 
 mod place;
+mod wire;
 
 use std::collections::BTreeSet;
 
@@ -33,7 +34,12 @@ use super::{
 const RETOLD_M: f64 = 10.0;
 /// Distance within which two stretches are the same place, metres: less than that of two lines of a road.
 const NEAR_M: f64 = 1.5;
-/// The same of a line that moved and of where it vanished or appeared: as far as lines move in one event.
+/// Distance within which two changes alike are one, metres: two lines that fusing holds apart where there is one, or the two of a
+/// double line.
+const COINCIDE_M: f64 = 0.75;
+/// Probability below which a change is not believed: what drives said since speaks against it.
+const LEAST_PROBABILITY: f64 = 0.5;
+/// Distance within which a line that moved and where it vanished or appeared are the same place, metres: as far as lines move in one event.
 const NEAR_MOVED_M: f64 = 2.7;
 
 /// What happened.
@@ -55,6 +61,9 @@ pub enum EventKind {
     /// A line is several lines.
     Split,
 }
+
+/// The names of all kinds.
+pub const EVENT_KINDS: [&str; 6] = ["appeared", "vanished", "moved", "renamed", "merged", "split"];
 
 impl EventKind {
     /// Whether it happened to the road, and not to names alone.
@@ -147,8 +156,7 @@ pub(super) struct Known<'a> {
 /// number.
 pub(super) fn told(known: &Known<'_>, fused: &FusedMap, after: &[v1::FusedLane]) -> Vec<CellEvent> {
     let is_left = |change: &MapChange| known.left.is_some_and(|left| change.noticed <= left);
-    let changes = fused.changes.iter().filter(|change| is_of(known.cell, change));
-    let believed: Vec<Believed<'_>> = changes.map(Believed::new).collect();
+    let believed = believed(known.cell, fused);
     let of_road: Vec<Remembered<'_>> =
         known.events.iter().filter(|event| event.kind.is_of_road()).map(Remembered::new).collect();
     let goes_on: BTreeSet<FusedLaneId> =
@@ -167,6 +175,22 @@ pub(super) fn told(known: &Known<'_>, fused: &FusedMap, after: &[v1::FusedLane])
     told.extend(believed.iter().filter(is_new).map(|it| it.event(known, fused)));
     told.extend(descents(known.lanes, after).into_iter().map(|descent| of_names(descent, known.lanes)));
     told
+}
+
+/// The changes of a cell that are believed, each once.
+fn believed(cell: CellId, fused: &FusedMap) -> Vec<Believed<'_>> {
+    let changes = fused.changes.iter().filter(|change| change.probability >= LEAST_PROBABILITY && is_of(cell, change));
+    let mut believed: Vec<Believed<'_>> = Vec::new();
+    for change in changes.map(Believed::new) {
+        let coincides = |other: &Believed<'_>| {
+            other.kind.is_same_kind(change.kind)
+                && place::is_same(&change.change.points, &other.change.points, COINCIDE_M)
+        };
+        if !believed.iter().any(coincides) {
+            believed.push(change);
+        }
+    }
+    believed
 }
 
 /// Gives events their numbers, of new ones of a sort the newest, and the version that tells of them.
@@ -427,9 +451,18 @@ mod tests {
         assert_eq!(teller.tell(vec![vanished(1, 0.0, 7)]), [], "6 m more are no news");
         let grown = teller.tell(vec![vanished(1, 0.0, 20)]);
         assert_eq!((numbers(&grown), grown[0].points().len()), (vec![(1, false)], 20));
-        // The other line of a double line goes as well; the first one's is still believed.
-        let beside = change(ChangeKind::Vanished, 2, (0.0, 0.3), 20, 78);
+        let coinciding = change(ChangeKind::Vanished, 3, (0.0, 0.3), 20, 78);
+        assert_eq!(teller.tell(vec![vanished(1, 0.0, 20), coinciding]), [], "the other line of a double line");
+        let beside = change(ChangeKind::Vanished, 2, (0.0, 1.2), 20, 78);
         assert_eq!(numbers(&teller.tell(vec![vanished(1, 0.0, 20), beside])), [(2, false)]);
+    }
+
+    #[test]
+    fn what_later_drives_speak_against_is_withdrawn() {
+        let mut teller = Teller::default();
+        teller.tell(vec![vanished(1, 0.0, 10)]);
+        let doubted = MapChange { probability: 0.4, ..vanished(1, 0.0, 10) };
+        assert_eq!(numbers(&teller.tell(vec![doubted])), [(1, true)]);
     }
 
     #[test]

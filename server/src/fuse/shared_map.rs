@@ -413,6 +413,25 @@ impl SharedMap {
         }))
     }
 
+    /// The events that the versions of a cell after one and up to another told last, in the order of their numbers. Reads
+    /// the store where there are any: most versions tell of none.
+    ///
+    /// # Errors
+    /// The store cannot be read.
+    pub fn events_between(
+        &self,
+        cell: CellId,
+        after: CellVersion,
+        until: CellVersion,
+    ) -> Result<Vec<CellEvent>, JournalError> {
+        if self.record(cell).is_none_or(|record| record.told_in <= after) {
+            return Ok(Vec::new());
+        }
+        let mut events = self.events(cell)?;
+        events.retain(|event| event.version > after && event.version <= until);
+        Ok(events)
+    }
+
     /// What happened in a cell, as far as it is kept, in the order of its numbers. Reads the store.
     ///
     /// # Errors

@@ -9,16 +9,19 @@ use std::{
 };
 
 use lanemap_core::{TimestampNs, fleet::CellId, geometry::georeference::Wgs84};
-use lanemap_proto::{encode, v1};
+use lanemap_proto::{
+    cell_map::{LaneKey, lane_key},
+    encode, v1,
+};
 use nalgebra::Point3;
 use prost::Message;
 
 use super::border::{Join, JoinedPiece, PieceName};
 
-/// Key of a lane within its cell, by which lanes are ordered.
-type Key = (String, u32);
-
-pub use lanemap_proto::lane_name::{lane_id_text, parse_lane_id};
+pub use lanemap_proto::{
+    cell_map::apply,
+    lane_name::{lane_id_text, parse_lane_id},
+};
 
 /// A cell in which nothing is.
 #[must_use]
@@ -36,11 +39,11 @@ pub(crate) fn lanes(pieces: &[JoinedPiece]) -> Vec<v1::FusedLane> {
 /// The changes that make `after` of `before`, two versions of one cell.
 #[must_use]
 pub fn changes(before: &v1::CellMap, after: &v1::CellMap) -> v1::CellChanges {
-    let known: BTreeMap<Key, &v1::FusedLane> = before.lanes.iter().map(|lane| (key(lane), lane)).collect();
-    let kept: BTreeSet<Key> = after.lanes.iter().map(key).collect();
+    let known: BTreeMap<LaneKey, &v1::FusedLane> = before.lanes.iter().map(|lane| (lane_key(lane), lane)).collect();
+    let kept: BTreeSet<LaneKey> = after.lanes.iter().map(lane_key).collect();
     // Compared as bytes: NaN never occurs, but -0.0 and 0.0 would pass for equal.
     let is_new = |lane: &&v1::FusedLane| {
-        known.get(&key(lane)).is_none_or(|before| before.encode_to_vec() != lane.encode_to_vec())
+        known.get(&lane_key(lane)).is_none_or(|before| before.encode_to_vec() != lane.encode_to_vec())
     };
     let removed = known.keys().filter(|key| !kept.contains(*key)).map(|(id, part)| v1::LaneName {
         cell: after.cell.clone(),
@@ -54,22 +57,6 @@ pub fn changes(before: &v1::CellMap, after: &v1::CellMap) -> v1::CellChanges {
         anchor: after.anchor,
         upserted: after.lanes.iter().filter(is_new).cloned().collect(),
         removed: removed.collect(),
-    }
-}
-
-/// Applies changes to the version that they were made from.
-#[must_use]
-pub fn apply(before: &v1::CellMap, changes: &v1::CellChanges) -> v1::CellMap {
-    let mut lanes: BTreeMap<Key, v1::FusedLane> = before.lanes.iter().map(|lane| (key(lane), lane.clone())).collect();
-    for name in &changes.removed {
-        lanes.remove(&(name.id.clone(), name.part));
-    }
-    lanes.extend(changes.upserted.iter().map(|lane| (key(lane), lane.clone())));
-    v1::CellMap {
-        cell: changes.cell.clone(),
-        version: changes.to_version,
-        anchor: changes.anchor,
-        lanes: lanes.into_values().collect(),
     }
 }
 
@@ -96,10 +83,6 @@ fn place(place: &Wgs84) -> v1::GeodeticPosition {
         longitude_deg: place.longitude_deg,
         height_m: place.height_m,
     }
-}
-
-fn key(lane: &v1::FusedLane) -> Key {
-    (lane.id.clone(), lane.part)
 }
 
 pub(crate) fn in_order(a: &v1::FusedLane, b: &v1::FusedLane) -> Ordering {

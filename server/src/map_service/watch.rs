@@ -79,14 +79,13 @@ fn within_borders(bounds: &v1::Bounds) -> Result<Followed, String> {
     Ok(Followed::Within([west, south, east, north]))
 }
 
-/// `None` for what HTTP alone tells.
-fn response(message: Message, most_bytes: usize) -> Option<v1::WatchChangesResponse> {
+fn response(message: Message, most_bytes: usize) -> v1::WatchChangesResponse {
     let (position, told) = match message {
         Message::Started(position) => {
             let (Position::At(revision) | Position::Within { since: revision, .. }) = position;
             (position, Told::Started(v1::WatchStarted { revision: revision.0 }))
         }
-        Message::Happened { .. } => return None,
+        Message::Happened { cell, event, position } => (position, Told::Event(event.message(cell))),
         Message::Alive(position) => (position, Told::Alive(v1::WatchAlive {})),
         Message::Reset { newest, oldest } => {
             (Position::At(newest), Told::Reset(v1::WatchReset { revision: newest.0, oldest_revision: oldest.0 }))
@@ -105,7 +104,7 @@ fn response(message: Message, most_bytes: usize) -> Option<v1::WatchChangesRespo
             (position, Told::Cell(cell))
         }
     };
-    Some(v1::WatchChangesResponse { position: position.to_string(), told: Some(told) })
+    v1::WatchChangesResponse { position: position.to_string(), told: Some(told) }
 }
 
 #[cfg(test)]

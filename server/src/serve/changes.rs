@@ -89,7 +89,7 @@ pub(super) async fn changes(State(state): State<ServeState>, request: Request) -
     let peer = peer_of(request.extensions())?;
     let Query { wanted, comes_again } = Query::read(&request)?;
     let most_bytes = state.feeds.most_event_bytes();
-    let encode = move |message| Some(event(message, most_bytes));
+    let encode = move |message| event(message, most_bytes);
     let opened = if comes_again {
         state.feeds.open_or_reset(peer, wanted, encode)
     } else {
@@ -174,7 +174,7 @@ fn event(message: Message, most_bytes: usize) -> Event {
         Message::Reset { newest, oldest } => {
             named("reset", Position::At(newest), &ResetData { revision: newest, oldest })
         }
-        Message::Happened { cell, event } => {
+        Message::Happened { cell, event, .. } => {
             let json = serde_json::to_string(&feature(cell, *event)).unwrap_or_default();
             // The change of the cell bears the id: one that is cut off before it is told of this again.
             Event::default().event("change").data(json)

@@ -27,7 +27,7 @@ use crate::fuse::{
 };
 
 /// A page of events, in the order of their numbers.
-#[derive(Serialize)]
+#[derive(Debug, Serialize)]
 #[serde(tag = "type", rename = "FeatureCollection")]
 struct Page {
     cell: String,
@@ -38,7 +38,7 @@ struct Page {
 }
 
 /// One event.
-#[derive(Serialize)]
+#[derive(Debug, Serialize)]
 #[serde(tag = "type", rename = "Feature")]
 pub(super) struct EventFeature {
     id: String,
@@ -47,14 +47,14 @@ pub(super) struct EventFeature {
     properties: EventProperties,
 }
 
-#[derive(Serialize)]
+#[derive(Debug, Serialize)]
 #[serde(tag = "type", rename = "LineString")]
 struct LineString {
     coordinates: Vec<Coordinate>,
 }
 
 /// What is known of an event.
-#[derive(Serialize)]
+#[derive(Debug, Serialize)]
 struct EventProperties {
     kind: &'static str,
     cell: String,
@@ -121,12 +121,18 @@ pub(super) async fn events(
     Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
 }
 
+/// Where an event happened, on the earth; nowhere of names.
+pub(super) fn places(cell: CellId, event: &CellEvent) -> Vec<Coordinate> {
+    let anchor = cell.anchor();
+    event.points().iter().map(|point| written(anchor.wgs84_from_enu(point))).collect()
+}
+
 /// An event as a feature.
 pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
     let code = u8::try_from(event.category).unwrap_or_default();
     let category = category_name(Category::from_openlane_code(code).unwrap_or_default());
     let id = format!("{cell}.event.{}", event.number);
-    let points = event.points();
+    let coordinates = places(cell, &event);
     let told_at = i64::try_from(event.published_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
     let properties = EventProperties {
         kind: event.kind.name(),
@@ -146,7 +152,5 @@ pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
         noticed: event.noticed_unix_ns.map(|noticed| rfc3339(TimestampNs(noticed))),
         drives: event.drives,
     };
-    let anchor = cell.anchor();
-    let coordinates: Vec<Coordinate> = points.iter().map(|point| written(anchor.wgs84_from_enu(point))).collect();
     EventFeature { id, geometry: (coordinates.len() > 1).then_some(LineString { coordinates }), properties }
 }

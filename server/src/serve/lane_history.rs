@@ -2,6 +2,9 @@
 //!
 //! Only versions are told in which the line differs from the version before. How far it moved is the farthest distance of
 //! its control points from the line as it was, to its side: where it grew it did not move.
+//!
+//! What is told of names (`/cells/{id}/events`) leads on: from which lines it came, and what it became, as far as such events are
+//! kept. A line that is in no kept version is told of where an event names it.
 
 use std::collections::BTreeMap;
 
@@ -19,6 +22,7 @@ use serde::Serialize;
 use super::{
     ServeState,
     entity_tag::EntityTag,
+    events::{EventFeature, feature},
     features::{category_name, rfc3339},
     in_background,
     line::rounded,
@@ -27,7 +31,7 @@ use super::{
     shared_lanes::feature_id,
 };
 use crate::{
-    fuse::{CellVersion, SharedMap, wire::positions},
+    fuse::{CellVersion, SharedMap, events::CellEvent, wire::positions},
     journal::JournalError,
 };
 
@@ -41,6 +45,30 @@ struct History {
     newest: CellVersion,
     /// The versions in which the line changed, the oldest first.
     versions: Vec<Entry>,
+    /// The lines that gave it paint; each has a history of its own.
+    came_from: Vec<Ancestor>,
+    /// The lines that it is now, where its name went or part of it did.
+    became: Vec<Heirs>,
+    /// What happened to its road.
+    events: Vec<EventFeature>,
+}
+
+/// A line that gave its paint to this one.
+#[derive(Debug, Serialize)]
+struct Ancestor {
+    kind: &'static str,
+    lane: String,
+    version: CellVersion,
+    at: String,
+}
+
+/// The lines to which this one gave its paint.
+#[derive(Debug, Serialize)]
+struct Heirs {
+    kind: &'static str,
+    lanes: Vec<String>,
+    version: CellVersion,
+    at: String,
 }
 
 /// The line in one version.
@@ -88,7 +116,7 @@ pub(super) async fn history(
     }
     let asked = lane.clone();
     let told = in_background(move || told(&state.map, cell, newest, &asked)).await??;
-    if told.versions.is_empty() {
+    if told.is_empty() {
         return Err(Problem::NoSuchLane { cell: cell.to_string(), lane: repeated(&lane) });
     }
     Ok(tag.on(Json(told)))
@@ -108,7 +136,48 @@ fn told(map: &SharedMap, cell: CellId, newest: CellVersion, lane: &str) -> Resul
             before = now;
         }
     }
-    Ok(History { cell: cell.to_string(), lane: lane.to_owned(), oldest_kept, newest, versions })
+    let (of_road, of_names): (Vec<_>, Vec<_>) = map
+        .events(cell)?
+        .into_iter()
+        .filter(|event| event.version <= newest)
+        .partition(|event| event.kind.is_of_road());
+    let came_from = of_names.iter().filter(|event| event.lane != lane && event.into.iter().any(|heir| heir == lane));
+    let became = of_names.iter().filter(|event| event.lane == lane);
+    Ok(History {
+        cell: cell.to_string(),
+        lane: lane.to_owned(),
+        oldest_kept,
+        newest,
+        versions,
+        came_from: came_from.map(Ancestor::of).collect(),
+        became: became.map(Heirs::of).collect(),
+        events: of_road.into_iter().filter(|event| event.lane == lane).map(|event| feature(cell, event)).collect(),
+    })
+}
+
+impl History {
+    fn is_empty(&self) -> bool {
+        self.versions.is_empty() && self.came_from.is_empty() && self.became.is_empty() && self.events.is_empty()
+    }
+}
+
+impl Ancestor {
+    fn of(event: &CellEvent) -> Self {
+        let at = published(event.published_ms);
+        Self { kind: event.kind.name(), lane: event.lane.clone(), version: event.version, at }
+    }
+}
+
+impl Heirs {
+    fn of(event: &CellEvent) -> Self {
+        let at = published(event.published_ms);
+        Self { kind: event.kind.name(), lanes: event.into.clone(), version: event.version, at }
+    }
+}
+
+/// When something was published, RFC 3339.
+fn published(published_ms: u64) -> String {
+    rfc3339(TimestampNs(i64::try_from(published_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX)))
 }
 
 fn entry(
@@ -118,10 +187,9 @@ fn entry(
     before: &[v1::FusedLane],
     now: &[v1::FusedLane],
 ) -> Entry {
-    let at_ns = i64::try_from(published_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
     Entry {
         version,
-        at: rfc3339(TimestampNs(at_ns)),
+        at: published(published_ms),
         features: now.iter().map(|piece| feature_id(cell, &piece.id, piece.part)).collect(),
         line: line(now),
         moved_m: (!before.is_empty() && !now.is_empty()).then(|| rounded(moved_m(before, now), 1e3)),

@@ -2,7 +2,10 @@
 
 use std::time::Duration;
 
-use lanemap_proto::v1::{self, admin_service_client::AdminServiceClient, ingest_service_client::IngestServiceClient};
+use lanemap_proto::v1::{
+    self, admin_service_client::AdminServiceClient, ingest_service_client::IngestServiceClient,
+    map_service_client::MapServiceClient,
+};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{
@@ -58,20 +61,47 @@ impl GrpcLink {
         &self,
         messages: mpsc::Receiver<v1::StreamObservationsRequest>,
     ) -> Result<Streaming<v1::StreamObservationsResponse>, ClientError> {
-        let mut request = Request::new(ReceiverStream::new(messages));
-        if let Some(token) = self.credentials.bearer().await? {
-            request.metadata_mut().insert("authorization", bearer(&token)?);
-        }
+        let request = self.signed(ReceiverStream::new(messages)).await?;
         let mut client = IngestServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_ANSWER_BYTES);
         Ok(client.stream_observations(request).await?.into_inner())
     }
 
     pub(crate) async fn forget(&self, request: v1::ForgetRequest) -> Result<v1::ForgetResponse, ClientError> {
-        let mut request = Request::new(request);
+        let request = self.signed(request).await?;
+        Ok(AdminServiceClient::new(self.channel.clone()).forget(request).await?.into_inner())
+    }
+
+    pub(crate) async fn watch(
+        &self,
+        request: v1::WatchChangesRequest,
+    ) -> Result<Streaming<v1::WatchChangesResponse>, ClientError> {
+        let request = self.signed(request).await?;
+        Ok(self.maps().watch_changes(request).await?.into_inner())
+    }
+
+    pub(crate) async fn changes(&self, request: v1::GetChangesRequest) -> Result<v1::CellChanges, ClientError> {
+        let request = self.signed(request).await?;
+        let answer = self.maps().get_changes(request).await?.into_inner();
+        answer.changes.ok_or_else(|| ClientError::Protocol("an answer without changes".to_owned()))
+    }
+
+    pub(crate) async fn cell(&self, request: v1::GetCellRequest) -> Result<v1::CellMap, ClientError> {
+        let request = self.signed(request).await?;
+        let answer = self.maps().get_cell(request).await?.into_inner();
+        answer.map.ok_or_else(|| ClientError::Protocol("an answer without a cell".to_owned()))
+    }
+
+    fn maps(&self) -> MapServiceClient<Channel> {
+        MapServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_ANSWER_BYTES)
+    }
+
+    /// A request with the token, where there is one.
+    async fn signed<T>(&self, message: T) -> Result<Request<T>, ClientError> {
+        let mut request = Request::new(message);
         if let Some(token) = self.credentials.bearer().await? {
             request.metadata_mut().insert("authorization", bearer(&token)?);
         }
-        Ok(AdminServiceClient::new(self.channel.clone()).forget(request).await?.into_inner())
+        Ok(request)
     }
 
     pub(crate) fn may_renew_token(&self) -> bool {

@@ -14,7 +14,7 @@
 
 use std::{collections::BTreeSet, path::Path};
 
-use lanemap_proto::zenoh_keys::{EVERY_ALIVE, EVERY_CELL, EVERY_OBSERVATIONS, PREFIX, SERVER};
+use lanemap_proto::zenoh_keys::{EVERY_ALIVE, EVERY_CELL, EVERY_EVENT, EVERY_OBSERVATIONS, PREFIX, SERVER};
 use serde_json::{Value, json};
 
 use crate::{
@@ -106,7 +106,7 @@ impl AccessRules {
             subjects.push(self.subject(&number.to_string(), &vehicle.encoded()));
             policies.push(json!({ "rules": ["asked", speaks, listens, hears], "subjects": [number.to_string()] }));
         }
-        let map = [EVERY_CELL.to_owned(), SERVER.to_owned()];
+        let map = [EVERY_CELL.to_owned(), EVERY_EVENT.to_owned(), SERVER.to_owned()];
         if !self.readers.is_empty() {
             rules.push(rule("reads", "ingress", &ASKS, &map));
             rules.push(rule("told", "egress", &SAYS, &map));
@@ -314,7 +314,9 @@ mod tests {
             ("ingress", "declare_subscriber", EVERY_CELL),
             ("ingress", "query", cell),
             ("ingress", "liveliness_query", SERVER),
+            ("ingress", "declare_subscriber", EVERY_EVENT),
             ("egress", "put", cell),
+            ("egress", "put", "lanemap/v1/map/14-8718-5685/events/7"),
             ("egress", "reply", cell),
         ] {
             assert!(allows(&rules, "reader 0", flow, message, key), "{flow} {message} {key}");

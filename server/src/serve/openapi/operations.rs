@@ -7,12 +7,12 @@ use super::{
     parameters::{BBOX, CRS, FORM, LIMIT, Parameter, path_id, revision, whole_number},
     schemas::{bytes, named, text},
 };
-use crate::export::Format;
 use crate::serve::{
     ogc::collection::Collection,
     sessions::{GEOJSON, PROTOBUF},
     tiles::VECTOR_TILE,
 };
+use crate::{export::Format, fuse::events::EVENT_KINDS};
 
 const FEATURES: &str = "OGC API - Features";
 const CELLS: &str = "Cells of the shared map";
@@ -150,6 +150,17 @@ pub(in crate::serve) fn cell_events() -> Operation {
          under its id, as withdrawn.",
     );
     operation.at(CELL_ID).takes([SINCE_REVISION, LIMIT, AFTER_EVENT]).answers(GEOJSON, named("CellEvents"))
+}
+
+pub(in crate::serve) fn map_events() -> Operation {
+    let kind = Parameter::new(
+        "kind",
+        "Kinds of events, separated by commas; without it, all.",
+        || json!({ "type": "string", "enum": EVENT_KINDS }),
+    );
+    let operation = Operation::new("mapEvents", CELLS, "What happened in all cells, the newest first.");
+    let operation = operation.describes("The member more says whether there are older ones.");
+    operation.takes([SINCE_REVISION, BBOX, kind, LIMIT]).answers(GEOJSON, named("MapEvents"))
 }
 
 pub(in crate::serve) fn spline_tile() -> Operation {

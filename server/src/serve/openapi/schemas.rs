@@ -2,6 +2,8 @@
 
 use serde_json::{Value, json};
 
+use crate::fuse::events::EVENT_KINDS;
+
 /// A schema that has a name in the document.
 pub(in crate::serve) fn named(name: &str) -> Value {
     json!({ "$ref": format!("#/components/schemas/{name}") })
@@ -208,16 +210,21 @@ fn trace() -> Value {
 
 fn lane_history() -> Value {
     let entry = object(json!({ "version": count(), "at": time(), "features": list(&text()) }), json!({}));
+    let kind = json!({ "type": "string", "enum": ["renamed", "merged", "split"] });
+    let descent = |others: Value| {
+        let members = json!({ "kind": kind, "version": count(), "at": time() });
+        object(members, others)
+    };
     let members = json!({
         "cell": text(), "lane": text(), "oldest_kept": count(), "newest": count(), "versions": list(&entry),
+        "came_from": list(&descent(json!({ "lane": text() }))), "became": list(&descent(json!({ "lanes": list(&text()) }))),
+        "events": list(&named("CellEvent")),
     });
     object(members, json!({}))
 }
 
 fn cell_event() -> Value {
-    let kinds = json!({
-        "type": "string", "enum": ["appeared", "vanished", "moved", "renamed", "merged", "split"],
-    });
+    let kinds = json!({ "type": "string", "enum": EVENT_KINDS });
     let properties = json!({
         "kind": kinds, "cell": text(), "revision": count(), "version": count(), "told_at": time(),
         "withdrawn": { "type": "boolean" }, "lane": text(), "category": text(), "probability": probability(),
@@ -275,6 +282,10 @@ pub(super) fn components() -> Value {
             "CellEvents": feature_collection(
                 &named("CellEvent"),
                 json!({ "cell": text(), "numberReturned": count(), "links": links() }),
+            ),
+            "MapEvents": feature_collection(
+                &named("CellEvent"),
+                json!({ "revision": count(), "numberReturned": count(), "more": { "type": "boolean" } }),
             ),
             "Differences": differences(),
             "LaneHistory": lane_history(),

@@ -1,24 +1,26 @@
-// The layer "change": where the map is another one than it was at the time that the slider shows.
+// What is asked for within the view: again when that moves, and when what is asked for changed, but not too often.
 
 /** Least time between two looks, milliseconds. */
 const PAUSE_MS = 1500;
 
-export class Differences {
+export class Around {
   #server;
+  #path;
   #draw;
   #asked;
   #looking = false;
   #timer;
 
-  /** `draw(features, more)` is called with what differs, `more` where there is more than that. */
-  constructor(server, draw) {
+  /** `path(asked)` is what to ask for, to which the view's `bbox` is added; `draw(told)` is called with the answer. */
+  constructor(server, path, draw) {
     this.#server = server;
+    this.#path = path;
     this.#draw = draw;
   }
 
-  /** Looks at what differs within a box since a revision; soon, where it has just looked. */
-  look(since, box) {
-    this.#asked = { since, box };
+  /** Looks within a box; soon, where it has just looked. */
+  look(box, asked) {
+    this.#asked = { box, asked };
     if (!this.#looking && this.#timer === undefined) this.#run();
   }
 
@@ -27,17 +29,17 @@ export class Differences {
     this.#asked = undefined;
     clearTimeout(this.#timer);
     this.#timer = undefined;
-    this.#draw([]);
+    this.#draw({ features: [] });
   }
 
   async #run() {
-    const { since, box } = this.#asked;
+    const { box, asked } = this.#asked;
     this.#asked = undefined;
     this.#looking = true;
     try {
       const corners = box.map((degrees, side) => Math.min(Math.max(degrees, side % 2 ? -90 : -180), side % 2 ? 90 : 180));
-      const told = await this.#server.json(`differences?since=${since}&bbox=${corners.map((degrees) => degrees.toFixed(6))}`);
-      if (this.#timer === undefined) this.#draw(told.features.map(flat), told.more);
+      const told = await this.#server.json(`${this.#path(asked)}&bbox=${corners.map((degrees) => degrees.toFixed(6))}`);
+      if (this.#timer === undefined) this.#draw(told);
     } catch (error) {
       // That the server is away is told by the feed.
       if (error.status === undefined && !(error instanceof TypeError)) throw error;
@@ -48,9 +50,4 @@ export class Differences {
       if (this.#asked) this.#run();
     }, PAUSE_MS);
   }
-}
-
-/** Cell and line of the feature, as the map's own lines have them. */
-function flat(feature) {
-  return { ...feature, properties: { ...feature.properties, part: 0 } };
 }

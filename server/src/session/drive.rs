@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use lanemap_core::{
-    Frame, Mapper, Params, Sequence, SnapshotError, StepReport, TimestampNs,
+    Frame, LaneMap, Mapper, Params, Sequence, SnapshotError, StepReport, TimestampNs,
     fleet::{DriveId, Trace},
 };
 use lanemap_proto::v1::RefusalReason;
@@ -38,6 +38,8 @@ pub(crate) struct Drive {
     ends: Ends,
     /// The last frame that was mapped, where nothing is cut; admitted ones may still wait for it.
     mapped: Option<(Sequence, TimestampNs)>,
+    /// The map that was shown last, and of how many frames it was made.
+    shown: Option<(MapVersion, Arc<LaneMap>)>,
 }
 
 /// Raise it where the bytes of a [`Trace`] change: what an earlier build wrote is then passed over.
@@ -201,7 +203,7 @@ impl Drive {
     pub(crate) fn new(setup: &SessionSetup, cut: TripCut) -> Self {
         let mapper = Mapper::new(Params::preset(setup.preset), setup.sensor);
         let (progress, ends) = (Progress::default(), Ends::default());
-        Self { mapper, trace: Arc::default(), way: Way::default(), progress, cut, ends, mapped: None }
+        Self { mapper, trace: Arc::default(), way: Way::default(), progress, cut, ends, mapped: None, shown: None }
     }
 
     /// The drive of [`Drive::snapshot`]'s bytes.
@@ -212,7 +214,8 @@ impl Drive {
         let (trace, _) = part_of::<TracePart>(rest)?;
         let (trace, mapped) = (trace.read(), progress.last);
         let way = Way::of(&trace);
-        Ok(Self { mapper: Mapper::restore(&mapper)?, trace: Arc::new(trace), way, progress, cut, ends, mapped })
+        let mapper = Mapper::restore(&mapper)?;
+        Ok(Self { mapper, trace: Arc::new(trace), way, progress, cut, ends, mapped, shown: None })
     }
 
     /// The whole state as bytes. Call it only when every frame that may be mapped was mapped.
@@ -379,16 +382,17 @@ impl Drive {
     }
 
     /// What is told of the drive while it sleeps, as bytes; nothing where it is hidden.
-    pub(crate) fn summary_bytes(&self, session: SessionId, state: SessionState) -> Result<Vec<u8>, DriveError> {
+    pub(crate) fn summary_bytes(&mut self, session: SessionId, state: SessionState) -> Result<Vec<u8>, DriveError> {
         let told = (!self.is_hidden()).then(|| self.published(session, state).summary);
         Ok(postcard::to_stdvec(&told)?)
     }
 
     /// What readers are shown.
-    pub(crate) fn published(&self, session: SessionId, state: SessionState) -> PublishedMap {
+    pub(crate) fn published(&mut self, session: SessionId, state: SessionState) -> PublishedMap {
+        let version = MapVersion(self.progress.mapped);
         let summary = SessionSummary {
             session,
-            version: MapVersion(self.progress.mapped),
+            version,
             state,
             preset: self.mapper.params().preset,
             map_from_vehicle: self.mapper.map_from_vehicle(),
@@ -398,7 +402,19 @@ impl Drive {
             lanes: 0,
             extent: None,
         };
-        PublishedMap::new(summary, Arc::new(self.mapper.lane_map()), self.way.clone())
+        PublishedMap::new(summary, self.lane_map(version), self.way.clone())
+    }
+
+    /// The map of this version: made once, for its covariances cost as much as many steps of the mapper.
+    fn lane_map(&mut self, version: MapVersion) -> Arc<LaneMap> {
+        if let Some((shown, map)) = &self.shown
+            && *shown == version
+        {
+            return Arc::clone(map);
+        }
+        let map = Arc::new(self.mapper.lane_map());
+        self.shown = Some((version, Arc::clone(&map)));
+        map
     }
 
     /// What the drive, by this name, says to the shared map with what it publishes.

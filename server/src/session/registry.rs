@@ -410,7 +410,7 @@ fn summary_of(record: &SessionRecord, bytes: Option<&[u8]>) -> Option<SessionSum
 /// The map of a session that sleeps.
 fn read_published(journal: &Journal, session: SessionId) -> Result<Option<PublishedMap>, JournalError> {
     let Some(record) = journal.record(session)? else { return Ok(None) };
-    let Loaded { record, drive, .. } = Loaded::read(journal, record)?.caught_up(journal)?;
+    let Loaded { record, mut drive, .. } = Loaded::read(journal, record)?.caught_up(journal)?;
     Ok((!drive.is_hidden()).then(|| drive.published(session, state_without_stream(&record))))
 }
 

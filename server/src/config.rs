@@ -116,6 +116,9 @@ pub struct ServerConfig {
     pub max_streams_per_connection: usize,
     /// Frames of one session between the network and the journal, 1 to 4096; a faster vehicle waits.
     pub max_frames_in_flight: usize,
+    /// Frames of one session that are acked and wait to be mapped, in the journal, 1 to 1e6; a vehicle that is farther ahead
+    /// of its map waits.
+    pub max_unmapped_frames: usize,
     /// Bytes of frames of all sessions between the network and the journal, 1 MiB to 1 TiB; vehicles wait where there are more.
     pub max_bytes_in_flight: usize,
     /// Frames of a session that wait for one before them, 0 to 4096; more give it up as missing.
@@ -132,7 +135,8 @@ pub struct ServerConfig {
     pub snapshot_every_frames: u64,
     /// Least time between two publications of one session's map, milliseconds.
     pub publish_interval_ms: u64,
-    /// Time after which a session without a stream leaves memory (its map stays readable), seconds.
+    /// Time after which a session without a stream leaves memory (its map stays readable), seconds; one that is over leaves
+    /// at once.
     pub unload_after_s: u64,
     /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for.
     pub max_cached_map_bytes: usize,
@@ -236,6 +240,7 @@ impl Default for ServerConfig {
             max_connections: 8192,
             max_streams_per_connection: 1024,
             max_frames_in_flight: 64,
+            max_unmapped_frames: 600,
             max_bytes_in_flight: 256 * 1024 * 1024,
             reorder_window_frames: 32,
             reorder_wait_ms: 200,
@@ -356,6 +361,7 @@ impl ServerConfig {
         within("max_connections", self.max_connections as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_streams_per_connection", self.max_streams_per_connection as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_frames_in_flight", self.max_frames_in_flight as f64, 1.0, 4096.0, "1 ..= 4096")?;
+        within("max_unmapped_frames", self.max_unmapped_frames as f64, 1.0, 1e6, "1 ..= 1e6")?;
         within("max_bytes_in_flight", self.max_bytes_in_flight as f64, 1_048_576.0, 1e12, "1048576 ..= 1e12")?;
         within("reorder_window_frames", self.reorder_window_frames as f64, 0.0, 4096.0, "0 ..= 4096")?;
         within("reorder_wait_ms", self.reorder_wait_ms as f64, 0.0, 60_000.0, "0 ..= 60000")?;

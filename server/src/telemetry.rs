@@ -20,6 +20,8 @@ pub const GAPS: &str = "lanemap_frame_gaps_total";
 pub const REFUSALS: &str = "lanemap_refusals_total";
 /// Seconds of one step of a mapper.
 pub const STEP_SECONDS: &str = "lanemap_mapper_step_seconds";
+/// Frames that are acked and not mapped yet.
+pub const FRAMES_UNMAPPED: &str = "lanemap_frames_unmapped";
 /// Seconds from a frame's decoding to its ack.
 pub const ACK_SECONDS: &str = "lanemap_frame_ack_seconds";
 /// Seconds of one durable commit of the journal.
@@ -130,6 +132,7 @@ fn describe() {
     describe_counter!(FRAMES_REPEATED, Unit::Count, "Frames that came again and were acked again");
     describe_counter!(GAPS, Unit::Count, "Runs of frames that did not come before those after them were taken");
     describe_counter!(REFUSALS, Unit::Count, "Messages refused, by reason");
+    describe_gauge!(FRAMES_UNMAPPED, Unit::Count, "Frames that are acked and not mapped yet");
     describe_histogram!(STEP_SECONDS, Unit::Seconds, "One step of a mapper");
     describe_histogram!(ACK_SECONDS, Unit::Seconds, "From a frame's decoding to its ack");
     describe_histogram!(COMMIT_SECONDS, Unit::Seconds, "One durable commit of the journal");

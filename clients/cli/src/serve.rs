@@ -169,6 +169,11 @@ pub struct ServeArgs {
     /// [env: LANEMAP_MAX_FRAMES_IN_FLIGHT] [default: 64]
     #[arg(long, value_name = "N")]
     max_frames_in_flight: Option<usize>,
+    /// Frames of one session that are acked and wait to be mapped, in the journal; a vehicle that is farther ahead of its
+    /// map waits
+    /// [env: LANEMAP_MAX_UNMAPPED_FRAMES] [default: 600]
+    #[arg(long, value_name = "N")]
+    max_unmapped_frames: Option<usize>,
     /// Bytes of frames of all sessions between the network and the journal, 1 MiB to 1 TiB; vehicles wait where there are more
     /// [env: LANEMAP_MAX_BYTES_IN_FLIGHT] [default: 268435456]
     #[arg(long, value_name = "BYTES")]
@@ -200,7 +205,8 @@ pub struct ServeArgs {
     /// [env: LANEMAP_PUBLISH_INTERVAL_MS] [default: 150]
     #[arg(long, value_name = "MS")]
     publish_interval_ms: Option<u64>,
-    /// Time after which a session without a stream leaves memory (its map stays readable), seconds
+    /// Time after which a session without a stream leaves memory (its map stays readable), seconds; one that is over leaves
+    /// at once
     /// [env: LANEMAP_UNLOAD_AFTER_S] [default: 60]
     #[arg(long, value_name = "S")]
     unload_after_s: Option<u64>,
@@ -342,6 +348,7 @@ impl ServeArgs {
             max_connections: self.max_connections,
             max_streams_per_connection: self.max_streams_per_connection,
             max_frames_in_flight: self.max_frames_in_flight,
+            max_unmapped_frames: self.max_unmapped_frames,
             max_bytes_in_flight: self.max_bytes_in_flight,
             reorder_window_frames: self.reorder_window_frames,
             reorder_wait_ms: self.reorder_wait_ms,

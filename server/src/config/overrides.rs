@@ -89,6 +89,8 @@ pub struct ConfigOverrides {
     pub max_streams_per_connection: Option<usize>,
     /// See [`ServerConfig::max_frames_in_flight`].
     pub max_frames_in_flight: Option<usize>,
+    /// See [`ServerConfig::max_unmapped_frames`].
+    pub max_unmapped_frames: Option<usize>,
     /// See [`ServerConfig::max_bytes_in_flight`].
     pub max_bytes_in_flight: Option<usize>,
     /// See [`ServerConfig::reorder_window_frames`].
@@ -198,6 +200,7 @@ impl ConfigOverrides {
         set(&mut settings.max_connections, self.max_connections);
         set(&mut settings.max_streams_per_connection, self.max_streams_per_connection);
         set(&mut settings.max_frames_in_flight, self.max_frames_in_flight);
+        set(&mut settings.max_unmapped_frames, self.max_unmapped_frames);
         set(&mut settings.max_bytes_in_flight, self.max_bytes_in_flight);
         set(&mut settings.reorder_window_frames, self.reorder_window_frames);
         set(&mut settings.reorder_wait_ms, self.reorder_wait_ms);

@@ -2,7 +2,7 @@
 //!
 //! It gathers the frames that are waiting, puts them in order (`intake`), makes them durable in one commit and acks them.
 //! Acked frames wait (`backlog`) until it is the session's turn at mapping, while others are taken and acked: an ack waits
-//! for the disk and for nothing else. Poses go back as frames are mapped. The actor publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
+//! for the disk and for nothing else, until `max_unmapped_frames` wait. Poses go back as frames are mapped. The actor publishes the map at most every `publish_interval_ms` while frames flow, and always when they stop. It saves a
 //! snapshot every so many frames, when the drive ends, and before it leaves memory.
 
 mod backlog;
@@ -44,9 +44,9 @@ use backlog::Backlog;
 pub(crate) use command::{Arrival, Attach, Attached, Command, StreamNumber};
 use intake::Early;
 
-/// Acked frames that wait to be mapped are at most one in so many of those that a session may have in flight, when it
-/// takes more.
-const ACKED_SHARE: usize = 4;
+/// Frames that are taken together, and acked ones that wait in memory to be mapped, are one in so many of those that a
+/// session may have in flight.
+const TOGETHER_SHARE: usize = 4;
 /// Publications may take this share of the machine's time at most, those of all sessions together: one part in so many.
 const PUBLISH_SHARE: u32 = 20;
 
@@ -143,7 +143,8 @@ impl Actor {
         // Frames that wait are in flight: with a window of one more, those that they wait for still come through.
         let window = config.reorder_window_frames.min(config.max_frames_in_flight - 1);
         let reorder = Reorder::new(window, config.reorder_wait(), drive.last_sequence());
-        let backlog = Backlog::new(mapping_turns.clone(), &surroundings.journal, record.id, unmapped);
+        let together = config.max_frames_in_flight.div_ceil(TOGETHER_SHARE);
+        let backlog = Backlog::new(mapping_turns.clone(), &surroundings.journal, record.id, unmapped, together);
         let mut actor = Self {
             surroundings,
             record,
@@ -201,7 +202,7 @@ impl Actor {
         let detached = gone.is_none();
         let overdue = self.reorder.deadline();
         // Acks run ahead of the map, but not far.
-        let takes_more = self.backlog.acked() < self.most_ahead();
+        let takes_more = self.backlog.acked() < self.surroundings.config.max_unmapped_frames;
         tokio::select! {
             biased;
             command = self.commands.recv(), if takes_more => match command {
@@ -257,7 +258,7 @@ impl Actor {
                 Command::Detach { stream, with } => {
                     // A stream that was closed in order brings nothing more; one that broke is resumed, and what is
                     // missing may come yet.
-                    if with.is_ok() && self.is_current(stream) && !self.nobody_reads() {
+                    if with.is_ok() && self.is_current(stream) && self.somebody_reads() {
                         self.pass_all(&mut batch).await?;
                     }
                     self.commit(&mut batch).await?;
@@ -266,7 +267,7 @@ impl Actor {
                     }
                 }
             }
-            let full = taken >= self.most_ahead();
+            let full = taken >= self.most_together();
             next = if full { None } else { self.commands.try_recv().ok() };
         }
         self.commit(&mut batch).await?;
@@ -274,9 +275,9 @@ impl Actor {
         Ok(())
     }
 
-    /// Acked frames that may wait to be mapped when more are taken, and frames that are taken together.
-    fn most_ahead(&self) -> usize {
-        self.surroundings.config.max_frames_in_flight.div_ceil(ACKED_SHARE)
+    /// Commands that are taken together.
+    fn most_together(&self) -> usize {
+        self.surroundings.config.max_frames_in_flight.div_ceil(TOGETHER_SHARE)
     }
 
     fn is_current(&self, stream: StreamNumber) -> bool {
@@ -288,10 +289,8 @@ impl Actor {
             // Its sender sees that it was dropped, and starts the next actor.
             return Ok(());
         }
-        if !self.backlog.is_catching_up() {
-            // The poses of what was acked are the stream's before.
-            self.map_all_acked().await?;
-        }
+        // The poses of what was acked are the stream's before.
+        self.backlog.begin_stream();
         if let Some(before) = self.stream.take() {
             before.outbox.finish(Err(Error::Superseded.into()));
         }
@@ -312,13 +311,14 @@ impl Actor {
     }
 
     async fn detach(&mut self, with: Result<(), Status>) -> Outcome {
-        if !self.stops_before_it_caught_up() {
+        // Who broke off comes back, and does not wait for the map.
+        if with.is_ok() && self.somebody_reads() && !self.stops_before_it_caught_up() {
             self.map_all_acked().await?;
         }
         let stream = self.stream.take();
         self.reorder.restart(self.drive.last_sequence());
         self.unload_at = self.unload_time();
-        // Published before the vehicle hears of it: who waits for the end of a stream reads all of its frames.
+        // Published before the vehicle hears of it: who waits for the end of a stream that it closed reads all of its frames.
         self.publish();
         if let Some(stream) = stream {
             stream.outbox.finish(with);
@@ -326,8 +326,12 @@ impl Actor {
         Ok(())
     }
 
-    /// When a drive without a stream leaves memory. One that holds frames stays until its trip counts as over.
+    /// When a drive without a stream leaves memory: at once where it is over. One that holds frames stays until its trip
+    /// counts as over.
     fn unload_time(&self) -> Instant {
+        if self.record.ended {
+            return Instant::now();
+        }
         let after = self.surroundings.config.unload_after();
         let stop = Duration::from_secs_f64(self.record.cut.stop_s);
         Instant::now() + if self.drive.holds_frames() { after.max(stop) } else { after }
@@ -340,8 +344,8 @@ impl Actor {
         }
     }
 
-    fn nobody_reads(&self) -> bool {
-        self.stream.as_ref().is_some_and(|stream| stream.outbox.is_closed())
+    fn somebody_reads(&self) -> bool {
+        self.stream.as_ref().is_some_and(|stream| !stream.outbox.is_closed())
     }
 
     /// Makes the batch durable, acks it, and has it wait to be mapped.

@@ -1,6 +1,6 @@
 //! What may be between the network and the journal: frames of one session, and bytes of all of them.
 //!
-//! A vehicle that sends more waits until its frames are mapped; it is not read from meanwhile. No session gets more than
+//! A vehicle that sends more waits until some are mapped, or put off; it is not read from meanwhile. No session gets more than
 //! a share of the bytes, so that one that sends huge frames does not make the others wait.
 
 use std::sync::Arc;

@@ -1,8 +1,13 @@
 //! Frames that wait to be mapped, and the session's place in the line for it.
 //!
-//! First those that the journal has and the map has not, after a crash: they are read as they are mapped, so that a vehicle
-//! that comes back is heard at once. Then those that were acked since, bounded by what may be in flight: each keeps its
-//! place there until it is mapped.
+//! They are mapped in their order, which is that of three parts:
+//!
+//! 1. frames that the journal has and the map has not, after a crash: a vehicle that comes back is heard before them;
+//! 2. frames that were acked since, a few, which keep their place among those in flight until they are mapped;
+//! 3. frames that were acked while those few were still waiting. They leave memory, and are read from the journal when it
+//!    is their turn: a machine that maps too slowly for a while goes on acking, and what waits costs it no memory.
+
+mod journaled;
 
 use std::collections::VecDeque;
 
@@ -17,83 +22,140 @@ use crate::{
         drive::Unmapped,
         in_flight::FramePlace,
         mapping_turns::{MappingTurn, MappingTurns},
-        registry::blocking,
     },
+    telemetry,
 };
-
-/// Frames read from the journal at a time.
-const FRAMES_PER_READ: usize = 64;
+use journaled::Journaled;
 
 /// The frames of one session that wait.
 pub(super) struct Backlog {
-    journaled: Option<Journaled>,
+    /// Left by a crash.
+    left: Option<Journaled>,
     acked: VecDeque<Arrival>,
+    /// Acked after those.
+    put_off: Option<Journaled>,
+    /// Frames of `put_off`.
+    put_off_count: usize,
+    /// Frames at the front, acked and put off, that came by a stream before the one that is open.
+    unheard: usize,
+    /// Acked frames that are kept in memory, at the most.
+    most_in_memory: usize,
+    journal: Journal,
+    session: SessionId,
     turns: MappingTurns,
     /// The place in the line, once it was asked for.
     in_line: Option<BoxFuture<'static, MappingTurn>>,
 }
 
-/// What the journal has and the map has not.
-struct Journaled {
-    journal: Journal,
-    session: SessionId,
-    /// What is still to be read.
-    rest: Unmapped,
-    read: VecDeque<Frame>,
-    reading: Option<BoxFuture<'static, Result<Vec<Frame>, JournalError>>>,
+/// The next frame to map.
+pub(super) struct Waiting {
+    pub(super) frame: Frame,
+    pub(super) from: Origin,
+    /// Its place among those in flight, where it has kept one; free again when dropped.
+    _place: Option<FramePlace>,
 }
 
-/// The next frame to map.
-pub(super) enum Waiting {
-    /// One from the journal, of which its vehicle heard before, or hears no more.
-    Journaled(Frame),
-    /// One that was acked just now, and its place among those in flight.
-    Acked(Frame, FramePlace),
+/// Where a frame that waits comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Origin {
+    /// A crash left it.
+    Crash,
+    /// A stream that is over: nobody waits for its pose.
+    StreamBefore,
+    /// The stream that is open.
+    Stream,
 }
 
 impl Backlog {
     /// Nothing waits but what is `unmapped` in the journal.
-    pub(super) fn new(turns: MappingTurns, journal: &Journal, session: SessionId, unmapped: Option<Unmapped>) -> Self {
-        let journaled = unmapped.map(|rest| Journaled {
+    pub(super) fn new(
+        turns: MappingTurns,
+        journal: &Journal,
+        session: SessionId,
+        unmapped: Option<Unmapped>,
+        most_in_memory: usize,
+    ) -> Self {
+        Self {
+            left: unmapped.map(Journaled::new),
+            acked: VecDeque::new(),
+            put_off: None,
+            put_off_count: 0,
+            unheard: 0,
+            most_in_memory,
             journal: journal.clone(),
             session,
-            rest,
-            read: VecDeque::new(),
-            reading: None,
-        });
-        Self { journaled, acked: VecDeque::new(), turns, in_line: None }
+            turns,
+            in_line: None,
+        }
     }
 
-    /// Adds frames that were acked.
+    /// Adds frames that were acked: they are in the journal.
     pub(super) fn extend(&mut self, frames: Vec<Arrival>) {
-        self.acked.extend(frames);
+        metrics::gauge!(telemetry::FRAMES_UNMAPPED).increment(frames.len() as f64);
+        for arrival in frames {
+            match &mut self.put_off {
+                Some(put_off) => put_off.extend_to(arrival.frame.sequence()),
+                None if self.acked.len() < self.most_in_memory => {
+                    self.acked.push_back(arrival);
+                    continue;
+                }
+                None => {
+                    let after = self.acked.back().map(|last| last.frame.sequence());
+                    self.put_off = Some(Journaled::new(Unmapped { after, through: arrival.frame.sequence() }));
+                }
+            }
+            self.put_off_count += 1;
+        }
     }
 
     /// Whether all frames are mapped.
     pub(super) fn is_empty(&self) -> bool {
-        self.journaled.is_none() && self.acked.is_empty()
+        self.left.is_none() && self.acked() == 0
     }
 
-    /// Frames that wait and were acked just now.
+    /// Frames that wait and were acked since the drive was read.
     pub(super) fn acked(&self) -> usize {
-        self.acked.len()
+        self.acked.len() + self.put_off_count
     }
 
-    /// Whether frames of the journal wait.
+    /// Whether frames wait that a crash left.
     pub(super) fn is_catching_up(&self) -> bool {
-        self.journaled.is_some()
+        self.left.is_some()
+    }
+
+    /// Whether more waits than is kept in memory.
+    pub(super) fn is_long(&self) -> bool {
+        self.left.is_some() || self.put_off.is_some()
+    }
+
+    /// Another stream opens: nobody waits for the poses of what the one before brought.
+    pub(super) fn begin_stream(&mut self) {
+        self.unheard = self.acked();
     }
 
     /// The next frame to map, where it is read.
     pub(super) fn pop(&mut self) -> Option<Waiting> {
-        let Some(journaled) = &mut self.journaled else {
-            return self.acked.pop_front().map(|Arrival { frame, place, .. }| Waiting::Acked(frame, place));
-        };
-        let frame = journaled.read.pop_front();
-        if journaled.read.is_empty() && journaled.rest.is_empty() {
-            self.journaled = None;
+        if let Some(left) = &mut self.left {
+            let frame = left.pop();
+            self.left.take_if(|left| left.is_done());
+            return frame.map(|frame| Waiting { frame, from: Origin::Crash, _place: None });
         }
-        frame.map(Waiting::Journaled)
+        let (frame, place) = match self.acked.pop_front() {
+            Some(Arrival { frame, place, .. }) => (frame, Some(place)),
+            None => {
+                let put_off = self.put_off.as_mut()?;
+                let frame = put_off.pop();
+                self.put_off_count = self.put_off_count.saturating_sub(usize::from(frame.is_some()));
+                if put_off.is_done() {
+                    (self.put_off, self.put_off_count) = (None, 0);
+                }
+                (frame?, None)
+            }
+        };
+        let from = if self.unheard > 0 { Origin::StreamBefore } else { Origin::Stream };
+        self.unheard = self.unheard.saturating_sub(1);
+        metrics::gauge!(telemetry::FRAMES_UNMAPPED).decrement(1.0);
+        Some(Waiting { frame, from, _place: place })
     }
 
     /// Waits for a turn at mapping; for ever where no frame waits. Who is interrupted and asks again has kept the place in
@@ -102,8 +164,12 @@ impl Backlog {
     /// # Errors
     /// The journal cannot be read.
     pub(super) async fn turn(&mut self) -> Result<MappingTurn, JournalError> {
-        if let Some(journaled) = &mut self.journaled {
-            journaled.read_some().await?;
+        let next = match &mut self.left {
+            Some(left) => Some(left),
+            None => self.put_off.as_mut().filter(|_| self.acked.is_empty()),
+        };
+        if let Some(next) = next {
+            next.read_some(&self.journal, self.session).await?;
         }
         if self.is_empty() {
             return std::future::pending().await;
@@ -119,22 +185,8 @@ impl Backlog {
     }
 }
 
-impl Journaled {
-    /// Has the next frames at hand.
-    async fn read_some(&mut self) -> Result<(), JournalError> {
-        if !self.read.is_empty() {
-            return Ok(());
-        }
-        let reading = self.reading.get_or_insert_with(|| {
-            let (journal, session, rest) = (self.journal.clone(), self.session, self.rest);
-            blocking(move || journal.frames_between(session, rest.after, rest.through)?.take(FRAMES_PER_READ).collect())
-                .boxed()
-        });
-        let read = reading.await;
-        self.reading = None;
-        self.read.extend(read?);
-        // The last one was there when the drive was read; without it nothing can be left.
-        self.rest.after = Some(self.read.back().map_or(self.rest.through, Frame::sequence));
-        Ok(())
+impl Drop for Backlog {
+    fn drop(&mut self) {
+        metrics::gauge!(telemetry::FRAMES_UNMAPPED).decrement(self.acked() as f64);
     }
 }

@@ -8,7 +8,7 @@ use tokio::time::Instant;
 
 use super::{
     Actor, Outcome,
-    backlog::Waiting,
+    backlog::Origin,
     updates::{local_map_update, pose_update},
 };
 use crate::{
@@ -42,17 +42,10 @@ impl Actor {
         tokio::task::yield_now().await;
         let began = Instant::now();
         while began.elapsed() < LONGEST_RUN {
-            match self.backlog.pop() {
-                Some(Waiting::Acked(frame, place)) => {
-                    self.map(&frame);
-                    drop(place);
-                }
-                Some(Waiting::Journaled(frame)) => {
-                    self.drive.map(&frame);
-                    self.unpublished = true;
-                    self.frames_since_snapshot += 1;
-                }
-                None => break,
+            let Some(waiting) = self.backlog.pop() else { break };
+            self.map(&waiting.frame, waiting.from == Origin::Stream);
+            if waiting.from == Origin::Crash {
+                self.frames_since_snapshot += 1;
             }
         }
         drop(turn);
@@ -70,7 +63,7 @@ impl Actor {
 
     /// Whether the service stops before the map has caught up with the journal: the next one goes on with it.
     pub(super) fn stops_before_it_caught_up(&self) -> bool {
-        self.backlog.is_catching_up() && self.surroundings.shutdown.is_cancelled()
+        self.backlog.is_long() && self.surroundings.shutdown.is_cancelled()
     }
 
     /// Maps frames that were held back when they were acked.
@@ -78,7 +71,7 @@ impl Actor {
         let turns = self.mapping_turns.clone();
         let (mut turn, mut began) = (turns.take().await, Instant::now());
         for frame in frames {
-            self.map(frame);
+            self.map(frame, true);
             if began.elapsed() >= LONGEST_RUN {
                 drop(turn);
                 tokio::task::yield_now().await;
@@ -95,12 +88,13 @@ impl Actor {
         blocking(move || journal.frames_between(session, covered, through)?.collect()).await
     }
 
-    fn map(&mut self, frame: &Frame) {
+    /// Maps a frame, and tells the vehicle of it where it waits for that.
+    fn map(&mut self, frame: &Frame, is_heard: bool) {
         let started = Instant::now();
         let report = self.drive.map(frame);
         metrics::histogram!(telemetry::STEP_SECONDS).record(started.elapsed().as_secs_f64());
         self.unpublished = true;
-        let Some(stream) = &self.stream else { return };
+        let Some(stream) = self.stream.as_ref().filter(|_| is_heard) else { return };
         stream.outbox.update(Message::Pose(pose_update(&report)));
         if stream.wants_local_map {
             stream.outbox.update(Message::LocalMap(local_map_update(&report, &self.drive)));

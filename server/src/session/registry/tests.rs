@@ -48,9 +48,9 @@ async fn next(answers: &mut OutboxStream) -> Message {
 }
 
 #[tokio::test]
-async fn an_ack_does_not_wait_for_mapping_and_no_more_wait_for_it_than_may_be_in_flight() {
+async fn an_ack_does_not_wait_for_mapping_until_as_many_frames_wait_for_it_as_may() {
     let folder = tempfile::tempdir().unwrap();
-    let config = ServerConfig { max_frames_in_flight: 12, ..ServerConfig::default() };
+    let config = ServerConfig { max_frames_in_flight: 12, max_unmapped_frames: 100, ..ServerConfig::default() };
     let registry = registry(folder.path(), config).await;
     let (outbox, mut answers) = Outbox::new();
     let attachment = registry.open(&start(), &outbox).await.unwrap();
@@ -59,28 +59,60 @@ async fn an_ack_does_not_wait_for_mapping_and_no_more_wait_for_it_than_may_be_in
     for _ in 0..cores() {
         others.push(registry.shared.mapping_turns.take().await);
     }
-    for number in 1..=3 {
+    for number in 1..=100 {
         attachment.send_frame(frame(number), Instant::now()).await.unwrap();
         assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: number }));
     }
-    // The frames that are acked are in flight still: with nine more the window is full, and the next one is not taken.
-    for number in 4..=12 {
+    // Three of those that are acked are in flight still: with nine more the window is full, and the next one is not taken.
+    for number in 101..=109 {
         attachment.send_frame(frame(number), Instant::now()).await.unwrap();
     }
-    let mut one_more = Box::pin(attachment.send_frame(frame(13), Instant::now()));
+    let mut one_more = Box::pin(attachment.send_frame(frame(110), Instant::now()));
     assert!(futures::poll!(one_more.as_mut()).is_pending());
     drop(others);
     one_more.await.unwrap();
     let mut poses = Vec::new();
-    let mut acked = 3;
-    while poses.len() < 13 {
+    let mut acked = 100;
+    while poses.len() < 110 {
         match next(&mut answers).await {
             Message::Pose(pose) => poses.push(pose.sequence),
             Message::Ack(ack) => acked = ack.acked_sequence_inclusive,
             other => panic!("{other:?}"),
         }
     }
-    assert_eq!((poses, acked), ((1..=13).collect(), 13));
+    assert_eq!((poses, acked), ((1..=110).collect(), 110));
+}
+
+#[tokio::test]
+async fn a_vehicle_that_comes_back_hears_of_the_frames_that_it_sends_then_and_its_map_has_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let registry = registry(folder.path(), ServerConfig::default()).await;
+    let mut others = Vec::new();
+    for _ in 0..cores() {
+        others.push(registry.shared.mapping_turns.take().await);
+    }
+    for (first, last) in [(1, 40), (41, 80)] {
+        let (outbox, mut answers) = Outbox::new();
+        let attachment = registry.open(&start(), &outbox).await.unwrap();
+        assert_eq!(attachment.at.last, Some(Sequence(first - 1)).filter(|_| first > 1));
+        for number in first..=last {
+            attachment.send_frame(frame(number), Instant::now()).await.unwrap();
+            assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: number }));
+        }
+        if last < 80 {
+            // Its connection breaks; nothing is mapped yet.
+            continue;
+        }
+        others.clear();
+        for number in first..=last {
+            let Message::Pose(pose) = next(&mut answers).await else { panic!("no pose") };
+            assert_eq!(pose.sequence, number);
+        }
+        attachment.send(|stream| Command::Detach { stream, with: Ok(()) }).await.unwrap();
+        outbox.finished().await;
+        let sessions = &registry.shared.surroundings.sessions;
+        assert_eq!(sessions.get(&attachment.session).unwrap().version.0, 80);
+    }
 }
 
 #[tokio::test]

@@ -5,5 +5,5 @@ pub mod curve;
 pub mod foot_point;
 pub mod sampling;
 
-pub use curve::{ControlPolygon, Curve, Segment, Support};
+pub use curve::{ControlPolygon, Curve, CurveWalk, Segment, Support};
 pub use foot_point::{FootPoint, foot_point_coarse, foot_point_refined};

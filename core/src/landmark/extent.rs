@@ -10,6 +10,7 @@
 
 use std::collections::VecDeque;
 
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 /// Stretches per control point.
@@ -73,23 +74,24 @@ fn middle_of(stretch: i64) -> f64 {
 }
 
 impl Extent {
-    /// Counts one frame's votes on the stretches between two parameters.
+    /// Counts one frame's votes on the stretches between two parameters, at which the line lies where `point_at` says.
     ///
-    /// `visibility` says how surely the detector would have reported the line at a parameter if it ran there, in `[0, 1]`.
+    /// `visibility` says how surely the detector would have reported the line at a place if it ran there, in `[0, 1]`.
     ///
     /// `variance` is that of the detection there, m^2.
     pub fn vote(
         &mut self,
         sighting: &Sighting,
-        from: f64,
-        to: f64,
-        visibility: impl Fn(f64) -> f64,
-        variance: impl Fn(f64) -> f64,
+        (from, to): (f64, f64),
+        mut point_at: impl FnMut(f64) -> Point3<f64>,
+        visibility: impl Fn(&Point3<f64>) -> f64,
+        variance: impl Fn(&Point3<f64>) -> f64,
     ) {
         for stretch in stretch_of(from)..=stretch_of(to) {
             let parameter = middle_of(stretch);
             let share = sighting.share(parameter);
-            let absent = if share < 1.0 { (1.0 - share) * visibility(parameter) } else { 0.0 };
+            let point = point_at(parameter);
+            let absent = if share < 1.0 { (1.0 - share) * visibility(&point) } else { 0.0 };
             if share == 0.0 && absent == 0.0 {
                 continue;
             }
@@ -99,7 +101,7 @@ impl Extent {
                 votes.seen += share as f32;
                 votes.absent += absent as f32;
                 if share > 0.0 {
-                    votes.information += (share / variance(parameter)) as f32;
+                    votes.information += (share / variance(&point)) as f32;
                 }
             }
         }
@@ -166,6 +168,10 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    fn along(parameter: f64) -> Point3<f64> {
+        Point3::new(3.0 * parameter, 0.0, 0.0)
+    }
+
     proptest! {
         /// Rows of a detector sweep over a line that ends at parameter 10.3; both overshoot it by up to a row.
         #[test]
@@ -176,7 +182,7 @@ mod tests {
                 let shift = phase + f64::from(frame) * 0.37;
                 let rows_to_end = ((end - shift) / spacing).floor() * spacing + shift;
                 let sighting = Sighting { reported: (0.0, rows_to_end + spacing), certain: (0.0, rows_to_end) };
-                extent.vote(&sighting, 0.0, 20.0, |_| 1.0, |_| 1.0);
+                extent.vote(&sighting, (0.0, 20.0), along, |_| 1.0, |_| 1.0);
             }
             let (_, to) = extent.drawn(0.5).unwrap();
             prop_assert!((to - end).abs() < 0.4, "{to}");
@@ -186,9 +192,11 @@ mod tests {
     #[test]
     fn what_cannot_be_seen_is_not_voted_away() {
         let mut extent = Extent::default();
-        extent.vote(&Sighting { reported: (0.0, 12.0), certain: (0.0, 12.0) }, 0.0, 12.0, |_| 1.0, |_| 1.0);
+        let whole = Sighting { reported: (0.0, 12.0), certain: (0.0, 12.0) };
+        extent.vote(&whole, (0.0, 12.0), along, |_| 1.0, |_| 1.0);
         for _ in 0..20 {
-            extent.vote(&Sighting { reported: (0.0, 5.0), certain: (0.0, 5.0) }, 0.0, 12.0, |_| 0.0, |_| 1.0);
+            let near = Sighting { reported: (0.0, 5.0), certain: (0.0, 5.0) };
+            extent.vote(&near, (0.0, 12.0), along, |_| 0.0, |_| 1.0);
         }
         assert_eq!(extent.drawn(0.5), Some((0.0, 12.0)));
     }

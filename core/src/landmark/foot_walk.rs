@@ -1,7 +1,8 @@
 //! Foot points of many samples of one lane: each search starts where the last one ended.
 //!
 //! `paper` looks for the nearest control points of every sample (`foot_point_coarse`), `default` walks on from the last foot
-//! point (`foot_point_refined`), which is right for samples in their order along the lane.
+//! point by as much as the one before (`foot_point_refined`), which is right for samples in their order along the lane: they
+//! are evenly spaced, and Newton begins a step nearer to its end.
 
 use std::collections::VecDeque;
 
@@ -21,7 +22,8 @@ pub struct FootWalk<'a> {
     near: (usize, usize),
     ends: EndRule,
     chord_m: f64,
-    last: Option<f64>,
+    /// The last foot point, and how far it lay from the one before.
+    last: Option<(f64, f64)>,
 }
 
 impl<'a> FootWalk<'a> {
@@ -46,9 +48,10 @@ impl<'a> FootWalk<'a> {
             }
             EndRule::Reflected => {
                 let start = self.start(query);
-                let foot = foot_point_refined(self.curve, query, start);
-                self.last = foot.map(|foot| foot.parameter).or(self.last);
-                foot
+                let foot = foot_point_refined(self.curve, query, start)?;
+                let stride = self.last.map_or(0.0, |(last, _)| foot.parameter - last);
+                self.last = Some((foot.parameter, stride));
+                Some(foot)
             }
         }
     }
@@ -68,6 +71,9 @@ impl<'a> FootWalk<'a> {
     }
 
     fn start(&self, query: &Point3<f64>) -> f64 {
-        self.last.unwrap_or_else(|| self.lane.nearest_index(query, self.near.0, self.near.1) as f64)
+        self.last.map_or_else(
+            || self.lane.nearest_index(query, self.near.0, self.near.1) as f64,
+            |(last, stride)| last + stride,
+        )
     }
 }

@@ -185,8 +185,10 @@ impl Landmark {
     /// Index of the control point nearest to `query` among some, both ends included.
     #[must_use]
     pub fn nearest_index(&self, query: &Point3<f64>, from: usize, to: usize) -> usize {
-        let squared = |index: usize| (self.positions()[index] - query).norm_squared();
-        (from..=to).min_by(|a, b| squared(*a).total_cmp(&squared(*b))).unwrap_or(from)
+        let last = to.min(self.information.len() - 1);
+        let between = if from <= last { from..last + 1 } else { 0..0 };
+        let squared = self.positions().range(between).map(|point| (point - query).norm_squared());
+        squared.zip(from..).min_by(|(a, _), (b, _)| a.total_cmp(b)).map_or(from, |(_, index)| index)
     }
 
     /// Index of a knot, held within the lane.
@@ -376,11 +378,9 @@ impl Landmark {
         let curve = self.curve(params.ends);
         if let Some(curve) = curve {
             let camera = map_from_vehicle.translation.vector;
-            let variance = |parameter: f64| {
-                let range_m = (curve.point(parameter - head).coords - camera).norm();
-                sigma_at(&params.noise, range_m).powi(2)
-            };
-            extent.vote(&sighting, from, to, |parameter| visibility(&curve.point(parameter - head)), variance);
+            let variance = |point: &Point3<f64>| sigma_at(&params.noise, (point.coords - camera).norm()).powi(2);
+            let mut walk = curve.walk();
+            extent.vote(&sighting, (from, to), |parameter| walk.point(parameter - head), visibility, variance);
         }
         self.extent = extent;
     }

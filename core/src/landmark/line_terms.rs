@@ -129,18 +129,22 @@ fn eliminate(
     let mut term =
         DenseTerm { first, count, information: vec![0.0; count * count], right: vec![Vector3::zeros(); count] };
     let mut coupling = vec![Vector3::zeros(); count];
+    let positions: Vec<Vector3<f64>> = (first..).take(count).map(|knot| lane.position(knot)).collect();
     let (mut normal, mut moments) = (prior(scale, params), Matrix3::zeros());
     let (mut residual_squared, mut residual_moments, mut used) = (0.0, Matrix3::zeros(), 0u32);
     for row in rows.iter().filter(inside) {
+        let mut entries = [(0, 0.0); 2 * SUPPORT];
+        let entries = gather(row, &mut entries, offset);
         let mut residual = row.value;
-        for (k, w) in entries(row) {
-            residual -= lane.position(k) * w;
-            let a = offset(k);
-            for (other, v) in entries(row) {
-                term.information[a * count + offset(other)] += row.weight * w * v;
+        for &(a, w) in entries {
+            residual -= positions[a] * w;
+            let scaled = row.weight * w;
+            let line = &mut term.information[a * count..(a + 1) * count];
+            for &(b, v) in entries {
+                line[b] += scaled * v;
             }
-            coupling[a] += row.basis * (row.weight * w);
-            term.right[a] += row.value * (row.weight * w);
+            coupling[a] += row.basis * scaled;
+            term.right[a] += row.value * scaled;
         }
         normal += row.basis * row.basis.transpose() * row.weight;
         moments += row.basis * row.value.transpose() * row.weight;
@@ -154,11 +158,13 @@ fn eliminate(
     let sigmas = ((residual_squared - explained).max(0.0) / (2.0 * f64::from(used.max(1)))).sqrt();
     let robust = if sigmas > params.huber_sigmas { params.huber_sigmas / sigmas } else { 1.0 };
     let solved: Vec<Vector3<f64>> = coupling.iter().map(|column| factor.solve(column)).collect();
-    for a in 0..count {
-        term.right[a] = (term.right[a] - moments.transpose() * solved[a]) * robust;
-        for (b, solved) in solved.iter().enumerate() {
-            let entry = &mut term.information[a * count + b];
-            *entry = (*entry - coupling[a].dot(solved)) * robust;
+    let moments = moments.transpose();
+    for (right, solved) in term.right.iter_mut().zip(&solved) {
+        *right = (*right - moments * solved) * robust;
+    }
+    for (line, coupling) in term.information.chunks_exact_mut(count.max(1)).zip(&coupling) {
+        for (entry, solved) in line.iter_mut().zip(&solved) {
+            *entry = (*entry - coupling.dot(solved)) * robust;
         }
     }
     term
@@ -168,12 +174,20 @@ fn prior(scale: f64, params: &LineErrorParams) -> Matrix3<f64> {
     Matrix3::from_diagonal(&Vector3::from(params.sigmas_m.map(|sigma| 1.0 / (scale * sigma * sigma).max(1e-12))))
 }
 
-/// Control points of a row with a weight that is not zero.
-fn entries(row: &ObservationRow) -> impl Iterator<Item = (Knot, f64)> + '_ {
-    row.supports
-        .iter()
-        .flat_map(|(first, weights)| (*first..).zip(weights.iter().copied()))
-        .filter(|(_, weight)| *weight != 0.0)
+/// Control points of a row with a weight that is not zero, by their offsets.
+fn gather<'a>(
+    row: &ObservationRow,
+    entries: &'a mut [(usize, f64); 2 * SUPPORT],
+    offset: impl Fn(Knot) -> usize,
+) -> &'a [(usize, f64)] {
+    let mut count = 0;
+    for (first, weights) in &row.supports {
+        for (knot, weight) in (*first..).zip(weights).filter(|(_, weight)| **weight != 0.0) {
+            entries[count] = (offset(knot), *weight);
+            count += 1;
+        }
+    }
+    &entries[..count]
 }
 
 #[cfg(test)]

@@ -120,6 +120,7 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
 
     /// Segment and position on it; parameters beyond the ends stay on the first or last segment.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // floored, and clamped to the segments
+    #[inline]
     fn locate(&self, parameter: f64) -> (usize, f64) {
         // A cast of a negative number is 0, and truncation is the floor of all others.
         let segment = (parameter as usize).clamp(self.first_segment(), self.last_segment());
@@ -149,6 +150,7 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
 
     /// The weighting that gives the point at a parameter.
     #[must_use]
+    #[inline]
     pub fn support(&self, parameter: f64) -> Support {
         let (segment, u) = self.locate(parameter);
         self.fold(segment, basis::weights(u))
@@ -176,6 +178,7 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
 
     /// The segment that holds a parameter, ready to be evaluated many times.
     #[must_use]
+    #[inline]
     pub fn segment_at(&self, parameter: f64) -> Segment {
         let (segment, _) = self.locate(parameter);
         let count = self.points.count();
@@ -193,6 +196,12 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
         }
     }
 
+    /// A walk along the curve, for points at parameters in their order.
+    #[must_use]
+    pub fn walk(&self) -> CurveWalk<'a, P> {
+        CurveWalk { curve: *self, segment: self.segment_at(self.first_parameter()) }
+    }
+
     fn combine(&self, support: &Support) -> Vector3<f64> {
         let mut sum = Vector3::zeros();
         for (k, weight) in support.weights.iter().enumerate() {
@@ -201,6 +210,23 @@ impl<'a, P: ControlPolygon + ?Sized> Curve<'a, P> {
             }
         }
         sum
+    }
+}
+
+/// Points of a curve one after the other: what shapes a segment is read once for all of its points.
+#[derive(Debug)]
+pub struct CurveWalk<'a, P: ?Sized> {
+    curve: Curve<'a, P>,
+    segment: Segment,
+}
+
+impl<P: ControlPolygon + ?Sized> CurveWalk<'_, P> {
+    /// Point of the curve, in the frame of its control points.
+    pub fn point(&mut self, parameter: f64) -> Point3<f64> {
+        if !self.segment.holds(parameter) {
+            self.segment = self.curve.segment_at(parameter);
+        }
+        self.segment.point(parameter)
     }
 }
 
@@ -220,12 +246,22 @@ impl Segment {
 
     /// Whether a parameter lies on this segment.
     #[must_use]
+    #[inline]
     pub fn holds(&self, parameter: f64) -> bool {
         (0.0..=1.0).contains(&(parameter - self.start))
     }
 
+    /// Point at a parameter of the curve.
+    #[must_use]
+    pub fn point(&self, parameter: f64) -> Point3<f64> {
+        let u = parameter - self.start;
+        let [c0, c1, c2, c3] = &self.coefficients;
+        (c0 + (c1 + (c2 + c3 * u) * u) * u).into()
+    }
+
     /// Point, first and second derivative at a parameter of the curve.
     #[must_use]
+    #[inline]
     pub fn evaluate(&self, parameter: f64) -> (Point3<f64>, Vector3<f64>, Vector3<f64>) {
         let u = parameter - self.start;
         let [c0, c1, c2, c3] = &self.coefficients;
@@ -243,6 +279,18 @@ mod tests {
         (0..count)
             .map(|i| Point3::new((i as f64 * 0.3).sin() * 10.0, (i as f64 * 0.3).cos() * 10.0, 0.1 * i as f64))
             .collect()
+    }
+
+    #[test]
+    fn a_walk_passes_the_points_of_its_curve_in_any_order_and_beyond_its_ends() {
+        let points = arc(7);
+        for ends in [EndRule::Open, EndRule::Reflected] {
+            let curve = Curve::new(points.as_slice(), ends).unwrap();
+            let mut walk = curve.walk();
+            for parameter in [-0.5, 0.0, 0.7, 1.0, 1.2, 3.9, 5.0, 6.0, 6.4, 2.5] {
+                assert!((walk.point(parameter) - curve.point(parameter)).norm() < 1e-12);
+            }
+        }
     }
 
     #[test]

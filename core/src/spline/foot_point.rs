@@ -5,8 +5,8 @@
 //! and the foot point on the polyline gives `u` ([`foot_point_coarse`]).
 //!
 //! Ours ([`foot_point_refined`]): from any starting parameter, Newton on `|p(t) - q|^2`, walking over segment borders,
-//! until the step is below a tenth of a millimetre: `t += <q - p, p'> / (|p'|^2 - <q - p, p''>)`, with the curvature term left out
-//! where it would make the denominator small. Not guaranteed: the global minimum on a curve that doubles back within
+//! up to a step of a few millimetres, after which what is left is its square: `t += <q - p, p'> / (|p'|^2 - <q - p, p''>)`,
+//! with the curvature term left out where it would make the denominator small. Not guaranteed: the global minimum on a curve that doubles back within
 //! a few chords of the start.
 
 use nalgebra::Point3;
@@ -78,8 +78,8 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
     start: f64,
 ) -> Option<FootPoint> {
     const ITERATIONS: usize = 12;
-    /// Steps shorter than this are not taken, control points.
-    const SETTLED: f64 = 3e-5;
+    /// A step shorter than this is the last, control points.
+    const SETTLED: f64 = 1e-3;
     /// Steps longer than this leave the neighbourhood in which the parabola is believed, control points.
     const LONGEST_STEP: f64 = 8.0;
     let (first, last) = (curve.first_parameter(), curve.last_parameter());
@@ -103,11 +103,12 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
         if (parameter <= first && step < 0.0) || (parameter >= last && step > 0.0) {
             return None;
         }
-        // Below a tenth of a millimetre along the curve the distance no longer changes.
-        if step.abs() < SETTLED {
+        let next = parameter + step;
+        parameter = next.clamp(first, last);
+        if step.abs() < SETTLED && parameter.to_bits() == next.to_bits() {
+            nearest = point + derivative * step;
             break;
         }
-        parameter = (parameter + step).clamp(first, last);
     }
     Some(FootPoint { parameter, distance_m: (query - nearest).norm() })
 }

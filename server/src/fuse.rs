@@ -8,7 +8,8 @@
 //!    and [swapped in](shared_map) for readers.
 //!
 //! Workers are threads of their own, never the runtime's; they take tasks in the order in which these became due
-//! ([`queue`]), and rest in between, so that they take no more than a share of a core. What a cell is fused from is its
+//! ([`queue`]), and rest in between, so that they take no more than a share of a core, and stand back (Linux) where frames
+//! wait to be taken. What a cell is fused from is its
 //! fingerprint: it is kept, and a start fuses nothing again that has not changed.
 
 mod bases;

@@ -40,6 +40,13 @@ const RETRY_PAUSE: Duration = Duration::from_secs(1);
 /// Pause after a task in which this program failed.
 const PAUSE_AFTER_FAULT: Duration = Duration::from_mins(1);
 
+/// How much nicer a fusing thread is than the rest of the service: what is ready to take frames and to ack them goes first.
+#[cfg(target_os = "linux")]
+const NICER: i32 = 5;
+/// The nicest that there is.
+#[cfg(target_os = "linux")]
+const NICEST: i32 = 19;
+
 pub(super) struct Worker {
     fuser: Fuser,
     store: CellStore,
@@ -78,6 +85,8 @@ impl Worker {
 
     /// Works until the service stops; then puts what drives have offered into the store, and ends.
     pub(super) fn run(self) {
+        #[cfg(target_os = "linux")]
+        stand_back();
         while let Some(taken) = self.next() {
             let started = Instant::now();
             let task = match &taken {
@@ -390,6 +399,20 @@ impl Worker {
         for near in near {
             queue.touch_cell(near, Instant::now());
         }
+    }
+}
+
+/// Lets the system run this thread after the others of the service, where there is too much for all.
+#[cfg(target_os = "linux")]
+fn stand_back() {
+    use rustix::{
+        process::{getpriority_process, setpriority_process},
+        thread::gettid,
+    };
+    let thread = Some(gettid());
+    let outcome = getpriority_process(thread).and_then(|nice| setpriority_process(thread, (nice + NICER).min(NICEST)));
+    if let Err(error) = outcome {
+        tracing::warn!(%error, "fusing has the priority of everything else");
     }
 }
 

@@ -140,22 +140,24 @@ impl Backlog {
             self.left.take_if(|left| left.is_done());
             return frame.map(|frame| Waiting { frame, from: Origin::Crash, _place: None });
         }
-        let (frame, place) = match self.acked.pop_front() {
-            Some(Arrival { frame, place, .. }) => (frame, Some(place)),
-            None => {
-                let put_off = self.put_off.as_mut()?;
-                let frame = put_off.pop();
-                self.put_off_count = self.put_off_count.saturating_sub(usize::from(frame.is_some()));
-                if put_off.is_done() {
-                    (self.put_off, self.put_off_count) = (None, 0);
-                }
-                (frame?, None)
-            }
-        };
+        let (frame, place) = self.pop_acked()?;
         let from = if self.unheard > 0 { Origin::StreamBefore } else { Origin::Stream };
         self.unheard = self.unheard.saturating_sub(1);
         metrics::gauge!(telemetry::FRAMES_UNMAPPED).decrement(1.0);
         Some(Waiting { frame, from, _place: place })
+    }
+
+    fn pop_acked(&mut self) -> Option<(Frame, Option<FramePlace>)> {
+        if let Some(Arrival { frame, place, .. }) = self.acked.pop_front() {
+            return Some((frame, Some(place)));
+        }
+        let put_off = self.put_off.as_mut()?;
+        let frame = put_off.pop();
+        self.put_off_count = self.put_off_count.saturating_sub(usize::from(frame.is_some()));
+        if put_off.is_done() {
+            (self.put_off, self.put_off_count) = (None, 0);
+        }
+        Some((frame?, None))
     }
 
     /// Waits for a turn at mapping; for ever where no frame waits. Who is interrupted and asks again has kept the place in

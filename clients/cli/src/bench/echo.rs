@@ -23,7 +23,6 @@ use super::{
     ingest::{self, LoadArgs},
     server_process::ServerProcess,
     tally::Tally,
-    tape::Tape,
     vehicle::Link,
 };
 
@@ -39,7 +38,7 @@ pub struct EchoArgs {
 
 /// Runs the load against an echo in a process of its own.
 pub fn run(args: &EchoArgs) -> anyhow::Result<ExitCode> {
-    let tapes = Tape::load(args.load.drives.as_deref(), &args.load.only)?;
+    let tapes = args.load.tapes()?;
     let server = ServerProcess::echo()?;
     ingest::runtime()?.block_on(async {
         let link = Link::Echo(Connections::open(&server.url, args.load.vehicles, ECHO).await?);

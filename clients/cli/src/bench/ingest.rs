@@ -4,6 +4,7 @@ use std::{path::PathBuf, process::ExitCode, sync::Arc, time::SystemTime};
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
+use lanemap_core::geometry::georeference::Georeference;
 use tokio::{
     sync::{mpsc, watch},
     task::JoinSet,
@@ -20,6 +21,7 @@ use super::{
     vehicle::{Fleet, Link},
     zenoh::Sessions,
 };
+use crate::replay::frames::parse_origin;
 
 /// The method of the ingest service that vehicles call.
 const STREAM_OBSERVATIONS: &str = "/lanemap.v1.IngestService/StreamObservations";
@@ -64,6 +66,10 @@ pub struct LoadArgs {
     /// Only drives whose name contains one of these texts
     #[arg(long, value_name = "NAME,..", value_delimiter = ',', requires = "drives")]
     pub only: Vec<String>,
+    /// Latitude and longitude (degrees) of the origin of the drives' world: frames carry GNSS fixes, so that the server fuses
+    /// the drives, too; all vehicles are on the same few roads then
+    #[arg(long, value_name = "LAT,LON", value_parser = parse_origin, allow_hyphen_values = true)]
+    pub origin: Option<Georeference>,
     /// Most frames of a vehicle unacked; never more than the server allows
     #[arg(long, value_name = "N", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub window: u32,
@@ -81,9 +87,16 @@ enum Transport {
     Zenoh,
 }
 
+impl LoadArgs {
+    /// What the vehicles stream.
+    pub fn tapes(&self) -> anyhow::Result<Vec<Tape>> {
+        Tape::load(self.drives.as_deref(), &self.only, self.origin.as_ref())
+    }
+}
+
 /// Runs the load; the exit code is 1 where a frame was lost.
 pub fn run(args: &IngestArgs) -> anyhow::Result<ExitCode> {
-    let tapes = Tape::load(args.load.drives.as_deref(), &args.load.only)?;
+    let tapes = args.load.tapes()?;
     match args.transport {
         Transport::Grpc => over_grpc(args, tapes),
         Transport::Zenoh => over_zenoh(args, tapes),

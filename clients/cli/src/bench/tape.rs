@@ -6,7 +6,9 @@ use std::path::Path;
 
 use anyhow::Context;
 use bytes::Bytes;
-use lanemap_core::{Frame, FrameLimits, Preset, Sensor, Sequence};
+use lanemap_core::{
+    Frame, FrameError, FrameLimits, FrameParts, Preset, Sensor, Sequence, geometry::georeference::Georeference,
+};
 use lanemap_openlane::{DriveFolder, Drives};
 use lanemap_proto::{
     encode,
@@ -20,6 +22,9 @@ const SEED: u64 = 1;
 /// Number and length of those drives: about a minute each.
 const SIMULATED_DRIVES: u32 = 8;
 const SIMULATED_LENGTH_M: f64 = 600.0;
+
+/// Standard deviation that the receiver states.
+const GNSS_SIGMA_M: f64 = 1.0;
 
 /// One drive.
 #[derive(Debug)]
@@ -39,41 +44,41 @@ pub struct DriveName<'a> {
 }
 
 impl Tape {
-    /// The drives of a folder in OpenLane's format, or simulated ones.
-    pub fn load(drives: Option<&Path>, only: &[String]) -> anyhow::Result<Vec<Self>> {
+    /// The drives of a folder in OpenLane's format, or simulated ones; with fixes where their world has an `origin`.
+    pub fn load(drives: Option<&Path>, only: &[String], origin: Option<&Georeference>) -> anyhow::Result<Vec<Self>> {
         let tapes = match drives {
             Some(folder) => {
                 let drives = Drives::list(folder, only)
                     .context("no drives to stream; --drives must name a folder of segment-* folders")?;
-                drives.iter().map(Self::of_recording).collect::<anyhow::Result<Vec<_>>>()?
+                drives.iter().map(|drive| Self::of_recording(drive, origin)).collect::<anyhow::Result<Vec<_>>>()?
             }
-            None => Self::simulated()?,
+            None => Self::simulated(origin)?,
         };
         let tapes: Vec<_> = tapes.into_iter().filter(|tape| !tape.frames.is_empty()).collect();
         anyhow::ensure!(!tapes.is_empty(), "the drives hold no frame");
         Ok(tapes)
     }
 
-    fn of_recording(drive: &DriveFolder) -> anyhow::Result<Self> {
+    fn of_recording(drive: &DriveFolder, origin: Option<&Georeference>) -> anyhow::Result<Self> {
         let mut sensor = Sensor::default();
         let mut frames = Vec::with_capacity(drive.len());
         for (recorded, sequence) in drive.frames().zip(1..) {
             let recorded = recorded?;
             sensor = recorded.annotation.sensor();
             let parts = recorded.frame_parts(Sequence(sequence), recorded.annotation.pose()?, None);
-            let frame = Frame::new(parts, &FrameLimits::default())
+            let frame = placed(parts, origin)
                 .with_context(|| format!("{} and its result file", recorded.annotation.path.display()))?;
             frames.push(encoded(&frame));
         }
         Ok(Self { sensor, frames })
     }
 
-    fn simulated() -> anyhow::Result<Vec<Self>> {
+    fn simulated(origin: Option<&Georeference>) -> anyhow::Result<Vec<Self>> {
         let scenario = Scenario { drives: SIMULATED_DRIVES, length_m: SIMULATED_LENGTH_M, ..Scenario::town(SEED) };
         let simulation = Simulation::run(&scenario);
         let tapes = simulation.drives.iter().map(|drive| {
             let frames = (0..drive.frames.len()).map(|index| {
-                let frame = Frame::new(drive.frame_parts(index, None), &FrameLimits::default())?;
+                let frame = placed(drive.frame_parts(index, None), origin)?;
                 Ok(encoded(&frame))
             });
             Ok(Self { sensor: drive.camera.sensor(), frames: frames.collect::<anyhow::Result<_>>()? })
@@ -113,6 +118,13 @@ impl Tape {
 /// The name of a vehicle.
 pub fn vehicle_id(vehicle: u32) -> String {
     format!("vehicle-{vehicle}")
+}
+
+/// A frame with the fix of a receiver at its pose, where the world has a place on the earth.
+fn placed(parts: FrameParts, origin: Option<&Georeference>) -> Result<Frame, FrameError> {
+    let pose = &parts.odometry.odometry_from_vehicle;
+    let fix = origin.map(|origin| origin.fix_at(pose, GNSS_SIGMA_M, GNSS_SIGMA_M));
+    Frame::new(FrameParts { gnss: fix.or(parts.gnss), ..parts }, &FrameLimits::default())
 }
 
 fn encoded(frame: &Frame) -> Bytes {

@@ -6,10 +6,10 @@ import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { DESK, PATIENCE_MS, PHONE, lanemap, launch, open, picture, replay, serve, settled } from "./stage.mjs";
+import { DESK, PATIENCE_MS, PHONE, found, lanemap, launch, open, picture, replay, serve, settled } from "./stage.mjs";
 
 const FLEET = [
-  "--roads", "straight", "--shared-route", "--both-directions", "--length-km", "0.65", "--drives", "14", "--changes", "1", "--seed", "3",
+  "--roads", "straight", "--shared-route", "--both-directions", "--length-km", "0.5", "--drives", "12", "--changes", "1", "--seed", "3",
 ];
 const KINDS = "kind=appeared,vanished,moved";
 
@@ -49,6 +49,7 @@ test("what happened to the road is drawn and listed with how sure it is and when
   assert.match(await card.locator("h2").innerText(), /appeared|vanished|moved/);
   assert.match(await card.innerText(), /probability[\s\S]*noticed[\s\S]*The drive of/);
   await settled(page);
+  assert.deepEqual(await found(page), [], "the card of a change");
   await picture(page, "changes-card-light");
 
   // The stretch itself is clicked, beside its mark.
@@ -79,6 +80,7 @@ test("changes are told in the dark and on a phone, and other layers say nothing 
   await listed(dark.page).first().waitFor({ timeout: PATIENCE_MS });
   await listed(dark.page).first().locator("button").click();
   await settled(dark.page);
+  assert.deepEqual(await found(dark.page), [], "the card of a change, in the dark");
   await picture(dark.page, "changes-card-dark");
   await dark.page.keyboard.press("1");
   await dark.page.locator("#happened").waitFor({ state: "hidden" });

@@ -2,7 +2,8 @@
 
 import { spawn } from "node:child_process";
 import { createSign, generateKeyPairSync } from "node:crypto";
-import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { createRequire } from "node:module";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { createInterface } from "node:readline";
@@ -65,6 +66,14 @@ export async function middleOfSomeLine() {
   const { coordinates } = longest.geometry;
   const [longitude, latitude] = coordinates[Math.floor(coordinates.length / 2)];
   return { latitude, longitude };
+}
+
+/** What axe finds on the page as it is, of what keeps people out. */
+export async function found(page) {
+  await page.evaluate(readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8"));
+  const { violations } = await page.evaluate(() => window.axe.run(document, { resultTypes: ["violations"] }));
+  const grave = violations.filter(({ impact }) => ["serious", "critical"].includes(impact));
+  return grave.flatMap(({ id, nodes }) => nodes.map(({ target, failureSummary }) => `${id} at ${target}: ${failureSummary}`));
 }
 
 /** Takes a picture of a page that stands still. */

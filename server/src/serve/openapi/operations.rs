@@ -155,8 +155,8 @@ pub(in crate::serve) fn cell_events() -> Operation {
 pub(in crate::serve) fn map_events() -> Operation {
     let kind = Parameter::new(
         "kind",
-        "Kinds of events, separated by commas; without it, all.",
-        || json!({ "type": "string", "enum": EVENT_KINDS }),
+        "Kinds of events; without it, all.",
+        || json!({ "type": "array", "minItems": 1, "items": { "type": "string", "enum": EVENT_KINDS } }),
     );
     let operation = Operation::new("mapEvents", CELLS, "What happened in all cells, the newest first.");
     let operation = operation.describes("The member more says whether there are older ones.");

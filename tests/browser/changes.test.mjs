@@ -6,7 +6,9 @@ import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { DESK, PATIENCE_MS, PHONE, found, lanemap, launch, open, picture, replay, serve, settled } from "./stage.mjs";
+import {
+  DESK, PATIENCE_MS, PHONE, found, lanemap, launch, open, picture, replay, serve, settled, untilDrawn,
+} from "./stage.mjs";
 
 const FLEET = [
   "--roads", "straight", "--shared-route", "--both-directions", "--length-km", "0.5", "--drives", "12", "--changes", "1", "--seed", "3",
@@ -19,8 +21,9 @@ before(async () => {
   const made = spawnSync(lanemap, ["simulate", "--out", join(folder, "drives"), ...FLEET], { encoding: "utf8" });
   assert.equal(made.status, 0, made.stderr);
   server = await serve(folder);
-  await replay(server.url, [], join(folder, "drives"));
-  for (let told = []; told.length === 0;) told = (await events()).filter(({ properties }) => !properties.withdrawn);
+  await replay(server.url, ["--origin", "45.06,7.67"], join(folder, "drives"));
+  for (let cells = {}; !(cells.settled && cells.total > 0);) cells = await (await fetch(`${server.url}/cells`)).json();
+  assert.ok((await events()).some(({ properties }) => !properties.withdrawn), "a change of the road is told");
   browser = await launch();
 });
 after(async () => {
@@ -47,7 +50,7 @@ test("what happened to the road is drawn and listed with how sure it is and when
   const card = page.locator("#card");
   await card.locator("h2").waitFor();
   assert.match(await card.locator("h2").innerText(), /appeared|vanished|moved/);
-  assert.match(await card.innerText(), /probability[\s\S]*noticed[\s\S]*The drive of/);
+  assert.match(await card.innerText(), /probability[\s\S]*noticed[\s\S]*drive of/);
   await settled(page);
   assert.deepEqual(await found(page), [], "the card of a change");
   await picture(page, "changes-card-light");
@@ -88,8 +91,8 @@ test("changes are told in the dark and on a phone, and other layers say nothing 
   await dark.close();
 
   const phone = await show(PHONE);
-  await phone.page.waitForFunction(async () =>
-    (await window.lanemap?.map?.map.getSource("events")?.getData())?.features.length > 0, undefined, { timeout: PATIENCE_MS });
+  await untilDrawn(phone.page);
+  await listed(phone.page).first().waitFor({ state: "attached", timeout: PATIENCE_MS });
   await picture(phone.page, "changes-phone");
   assert.deepEqual(phone.complaints, []);
   await phone.close();

@@ -29,6 +29,7 @@ TILE = dict(zip("zxy", CELL_14))
 THERE = {
     "/tiles/lanes/{z}/{x}/{y}": TILE,
     "/splines/{z}/{x}/{y}": TILE,
+    "/cells/{id}/events": {"id": "-".join(CELL_14)},
     **{
         f"/collections/{name}/items/{{id}}": {"id": get(f"/collections/{name}/items?limit=1")["features"][0]["id"]}
         for name in ["lanes", "control_points", "cells", "drives"]

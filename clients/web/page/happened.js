@@ -53,7 +53,7 @@ export function figures(event, metres) {
 }
 
 /** What happened, and how it came to be known. */
-export const says = (event) => `${SAYS[event.properties.kind] ?? ""} The drive of ${noticed(event)} was the one with which it was believed.`;
+export const says = (event) => `${SAYS[event.properties.kind] ?? ""} It is believed since the drive of ${noticed(event)}.`;
 
 /** The newest events in view, as a list; `choose(event)` is called with the one that is chosen. */
 export function list(events, choose) {

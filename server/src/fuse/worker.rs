@@ -244,6 +244,10 @@ impl Worker {
         let published = map.get(cell)?.map(|published| Arc::clone(&published.map));
         let known: Vec<CellEvent> = if fused.is_some() || purged { self.store.events(cell)? } else { Vec::new() };
         record.forgets |= !dropped.is_empty();
+        if purged {
+            // It is the start of a drive, maybe of the one that was deleted.
+            record.events_left = None;
+        }
         let told = fused.as_ref().map(|fused| {
             let earlier = published.as_ref().map(|published| published.lanes.as_slice()).unwrap_or_default();
             // What is told of the past may name the drive that was deleted.
@@ -303,8 +307,10 @@ impl Worker {
                 publication: encoded("a publication", &publication)?,
             })
         });
+        // A record of an earlier build may not know it.
+        let last = known.iter().map(|event| event.number).fold(record.last_event, u64::max);
         let told = publication.map(|Publication { revision, to_version, .. }| {
-            events::number(told, &known, kept.most, (revision, to_version, published_ms))
+            events::number(told, last, kept.most, (revision, to_version, published_ms))
         });
         let told = told.unwrap_or_default();
         let left = events::outdated(&known, &told, kept, purged);
@@ -312,6 +318,7 @@ impl Worker {
             let left = left.iter().filter_map(|event| event.noticed_unix_ns).map(TimestampNs).max();
             record.events_left = record.events_left.max(left);
         }
+        record.last_event = told.iter().map(|event| event.number).fold(last, u64::max);
         if !told.is_empty() {
             record.told_in = record.version;
         }

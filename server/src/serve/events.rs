@@ -91,7 +91,7 @@ pub(super) async fn events(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let parameters = Parameters::read(&uri, &["since", "limit", "after"])?;
-    let since = parameters.get("since", str::parse::<MapRevision>)?.unwrap_or_default();
+    let since = parameters.get("since", parse_since)?.unwrap_or_default();
     let limit = parameters.get("limit", |text| parse_limit(text, MOST_FEATURES))?.unwrap_or(DEFAULT_FEATURES);
     let number = |text: &str| whole_number(text).ok_or_else(|| "it must be the number of an event".to_owned());
     let after = parameters.get("after", number)?.unwrap_or(0);
@@ -119,6 +119,12 @@ pub(super) async fn events(
     };
     let body = serde_json::to_vec(&page).map_err(|_| Problem::Internal)?;
     Ok(tag.on(([(header::CONTENT_TYPE, GEOJSON)], body)))
+}
+
+/// Reads the revision of the map after which events are told.
+pub(super) fn parse_since(text: &str) -> Result<MapRevision, String> {
+    let since = whole_number(text).filter(|since| i64::try_from(*since).is_ok());
+    since.map(MapRevision).ok_or_else(|| format!("it must be a revision of the map, a whole number up to {}", i64::MAX))
 }
 
 /// Where an event happened, on the earth; nowhere of names.

@@ -14,7 +14,7 @@ use super::{
     ServeState,
     bounds::Bounds,
     entity_tag::EntityTag,
-    events::{EventFeature, feature, places},
+    events::{EventFeature, feature, parse_since, places},
     in_background,
     items::of_cell,
     ogc::{DEFAULT_FEATURES, MOST_FEATURES},
@@ -54,7 +54,7 @@ struct Asked {
 pub(super) async fn events(State(state): State<ServeState>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
     let parameters = Parameters::read(&uri, &["since", "bbox", "kind", "limit"])?;
     let asked = Asked {
-        since: parameters.get("since", str::parse::<MapRevision>)?.unwrap_or_default(),
+        since: parameters.get("since", parse_since)?.unwrap_or_default(),
         bounds: parameters.get("bbox", Bounds::parse)?,
         kinds: parameters.get("kind", parse_kinds)?.unwrap_or_else(|| EVENT_KINDS.to_vec()),
         limit: parameters.get("limit", |text| parse_limit(text, MOST_FEATURES))?.unwrap_or(DEFAULT_FEATURES),

@@ -53,6 +53,7 @@ pub mod base;
 pub mod cell;
 mod chain;
 pub mod change;
+mod continuity;
 pub mod contribution;
 pub mod correction;
 pub mod fusion;

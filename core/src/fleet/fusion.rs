@@ -16,6 +16,7 @@ use super::{
     alignment::{RobustScales, Sighting, Target, align},
     base::Base,
     change::MapChange,
+    continuity::run_on,
     contribution::{Contribution, DriveId},
     correction::Correction,
     georeferenced::UNBOUNDED_M,
@@ -316,6 +317,7 @@ impl<'a> Fusion<'a> {
         }
         for line in &mut self.lines.lines {
             line.settle(self.params);
+            run_on(line, self.params);
         }
         self.lines.index();
     }

@@ -59,6 +59,7 @@ pub mod correction;
 pub mod fusion;
 mod georeferenced;
 mod growth;
+mod joining;
 pub mod line;
 pub mod matching;
 pub mod params;

@@ -208,3 +208,49 @@ fn a_line_that_is_moved_is_one_event_and_lies_in_its_new_place() {
 fn a_road_that_stays_as_it_is_has_no_changes() {
     assert_eq!(fused(&Survey::of(&Road::bend(200.0), 31).drives(12)).changes, Vec::new());
 }
+
+/// A drive that lost one of its lines for some metres.
+fn interrupted(mut drive: Contribution, lane: usize, gap: std::ops::Range<usize>) -> Contribution {
+    let mut onward = drive.lanes[lane].clone();
+    onward.control_points.drain(..gap.end);
+    onward.id = lanemap_core::LaneId(drive.lanes.len() as u64 + 1);
+    drive.lanes[lane].control_points.truncate(gap.start);
+    for piece in [&mut onward, &mut drive.lanes[lane]] {
+        piece.drawn_to = (piece.control_points.len() - 1) as f64;
+    }
+    drive.lanes.push(onward);
+    drive
+}
+
+#[test]
+fn a_line_that_one_drive_lost_for_some_metres_is_one_line_when_another_sees_it_whole() {
+    let road = Road::bend(200.0);
+    let mut drives = Survey::of(&road, 41).drives(3);
+    let whole = fused(&drives);
+    drives[0] = interrupted(drives[0].clone(), 2, 30..33);
+    assert_eq!(fused(&drives[..1]).lanes.len(), road.lines.len() + 1, "nobody else was there yet");
+    let joined = fused(&drives);
+    let ids = |map: &FusedMap| map.lanes.iter().map(|lane| lane.id).collect::<Vec<_>>();
+    assert_eq!(ids(&joined), ids(&whole), "the older name stays");
+    let lines = joined.lanes.iter().zip(&whole.lanes);
+    for (joined, whole) in lines {
+        assert!(joined.points.len().abs_diff(whole.points.len()) <= 1);
+    }
+    let misfits = misfits_m(&joined, &road, best_shift(&joined, &road));
+    assert!(quantile(&misfits, 1.0) <= 0.35, "{:?}", misfits.last());
+}
+
+#[test]
+fn a_dashed_line_that_goes_on_solid_stays_two() {
+    let road = Road::bend(200.0);
+    let mut drives = Survey::of(&road, 42).drives(3);
+    drives[0] = interrupted(drives[0].clone(), 2, 30..31);
+    let solid = lanemap_core::Category::WhiteSolid;
+    let last = drives[0].lanes.len() - 1;
+    let onward = &mut drives[0].lanes[last];
+    onward.category = solid;
+    onward.category_posterior = vec![0.02 / 14.0; 15];
+    onward.category_posterior[solid.index()] = 0.98;
+    assert_eq!(fused(&drives[..1]).lanes.len(), road.lines.len() + 1);
+    assert_eq!(fused(&drives[..2]).lanes.len(), road.lines.len() + 1);
+}

@@ -11,6 +11,7 @@ use std::{
 use super::{
     contribution::Contribution,
     correction::Correction,
+    joining::{Link, join, leaves_at_end},
     line::{FusedLaneId, Knot, Line, Lines, witness_at},
     matching::{Run, match_lanes},
     params::FleetParams,
@@ -62,6 +63,9 @@ impl Growing<'_> {
         }
         // Decided for all lanes before any line grows: parameters of runs count from where the lines began.
         let rests = (0..matched.len()).flat_map(|lane| self.rests(lines, lane, &matched[lane]));
+        let links =
+            matched.iter().flat_map(|runs| runs.windows(2).filter_map(|pair| Link::of(lines, &pair[0], &pair[1])));
+        let links: Vec<Link> = links.collect();
         for rest in rests.collect::<Vec<Rest<'_>>>() {
             changed |= match rest.extends {
                 Some((run, onward)) => self.extend(lines, correction, &rest, run, onward),
@@ -74,6 +78,7 @@ impl Growing<'_> {
                 lines.lines[line].settle(self.params);
             }
         }
+        changed |= join(lines, &links, self.params);
         if changed {
             lines.index();
         }
@@ -177,12 +182,4 @@ impl Growing<'_> {
         lines.lines.push(line);
         true
     }
-}
-
-/// Whether a run ends (`onward`) or begins where its line does.
-fn leaves_at_end(lines: &Lines, run: &Run, onward: bool) -> bool {
-    const NEAR_END: f64 = 1.5;
-    let last = (lines.lines[run.line].points.len() - 1) as f64;
-    let at = if onward { run.parameters[run.parameters.len() - 1] } else { run.parameters[0] };
-    if run.is_forward() == onward { at > last - NEAR_END } else { at < NEAR_END }
 }

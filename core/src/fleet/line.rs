@@ -204,6 +204,18 @@ impl Line {
         }
     }
 
+    /// Adds the votes of a line that is now part of this one.
+    pub(super) fn take_votes(&mut self, other: &Self) {
+        let votes = other.category_votes.clone();
+        self.vote(&votes, 1.0);
+    }
+
+    /// Its most probable category, as a number among [`Category::ALL`].
+    pub(super) fn paint(&self) -> usize {
+        let best = self.posterior.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));
+        best.map_or(0, |(category, _)| category)
+    }
+
     /// Belief over its categories, in the order of [`Category::ALL`]: the mean of its witnesses'.
     pub(super) fn posterior(&self) -> &[f64] {
         &self.posterior

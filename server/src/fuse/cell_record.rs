@@ -8,7 +8,7 @@ use super::border::Crossing;
 use crate::{journal::cells::ContributionFact, session::SessionId};
 
 /// Raise it where the same contributions give another map: every cell is then fused again at the next start.
-const ALGORITHM: u32 = 6;
+const ALGORITHM: u32 = 7;
 
 /// Raise it where the bytes of contributions or of fused cells change: what an earlier build wrote is then written anew from
 /// the drives' snapshots.
@@ -47,8 +47,6 @@ pub struct CellRecord {
     pub(crate) forgets: bool,
     /// The last version that told of an event.
     pub(crate) told_in: CellVersion,
-    /// The number of the last event that was told of it.
-    pub(crate) last_event: u64,
 }
 
 /// What tells a set of contributions, and the way in which they are fused, from all others.

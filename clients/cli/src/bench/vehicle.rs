@@ -72,7 +72,13 @@ impl Fleet {
         loop {
             open.flow.go(pace);
             let sent = open.flow.sent().await;
-            drives.spawn(leave(open, stop_at + ACK_GRACE));
+            let leaving = leave(open, stop_at + ACK_GRACE);
+            match self.rate {
+                // Where frames are due, they go with the next drive while the server ends this one; a vehicle that is as
+                // fast as it may be ends one drive before it begins another.
+                FrameRate::Every(_) => drop(drives.spawn(leaving)),
+                FrameRate::Max => leaving.await,
+            }
             match sent {
                 Some(Sent::TimeIsUp) => break,
                 Some(Sent::WholeDrive(later)) => pace = later,

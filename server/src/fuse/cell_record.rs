@@ -47,6 +47,8 @@ pub struct CellRecord {
     pub(crate) forgets: bool,
     /// The last version that told of an event.
     pub(crate) told_in: CellVersion,
+    /// The number of the last event that was told of it.
+    pub(crate) last_event: u64,
 }
 
 /// What tells a set of contributions, and the way in which they are fused, from all others.

@@ -1,15 +1,15 @@
 //! How well changes of the road were noticed: precision and recall per stretch of 10 m, and how many drives it took.
 //!
 //! Both the true changes and the reported ones are told as paint that went and paint that came: a line that moved went from one
-//! place and came to another. They are cut into pieces of [`PIECE_M`] metres. A true piece is recalled if a report of the same
-//! sense, made since, passes within 1.5 m of its middle; a reported piece is right if a true one of the same sense and
-//! before it lies so near. A report that a line moved speaks for both: where it is now, and, within 3 m, where it was.
-//! The latency of a change is the number of drives that began after it, up to and with the one by which its first report
-//! came to be believed.
+//! place and came to another. They are cut into pieces of [`PIECE_M`] metres. A true piece is recalled if one of a report of the
+//! same sense, made since, overlaps it, at most 1.5 m across; a reported piece is right if it so overlaps a true one of
+//! the same sense and before it. A report that a line moved speaks for both: where it is now, and, within 3 m, where it was.
+//! The latency of a change is the number of drives with it in view that began after it, up to and with the one by which its
+//! first report came to be believed.
 //!
-//! Not guaranteed: that a change was in anybody's view. The caller leaves out those that none could see.
+//! Changes that drives could hardly tell are given as not asked: reports of them are right, but none is missed.
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector2};
 
 use super::quantile;
 use crate::{
@@ -33,12 +33,16 @@ pub struct TrueChange {
     pub went: Vec<Point3<f64>>,
     /// Where paint is that was not there; empty where nothing came.
     pub came: Vec<Point3<f64>>,
+    /// Starts of the drives that had it in view, before it and since.
+    pub in_view: Vec<TimestampNs>,
+    /// Whether it is missed where it is not reported.
+    pub asked: bool,
 }
 
 /// How well changes were noticed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ChangeScore {
-    /// True pieces.
+    /// True pieces that are asked.
     pub true_pieces: usize,
     /// Share of them that were reported.
     pub recall: f64,
@@ -61,6 +65,8 @@ enum Sense {
 
 struct Piece {
     middle: Point3<f64>,
+    /// Along it, of length 1.
+    direction: Vector2<f64>,
     sense: Sense,
     time: TimestampNs,
     /// Distance at which it is the same place as another.
@@ -68,14 +74,15 @@ struct Piece {
     of: usize,
 }
 
-/// Scores reports against what happened; `starts` are those of all drives, in their order.
+/// Scores reports against what happened.
 #[must_use]
-pub fn score_changes(reported: &[MapChange], truth: &[TrueChange], starts: &[TimestampNs]) -> ChangeScore {
+pub fn score_changes(reported: &[MapChange], truth: &[TrueChange]) -> ChangeScore {
     let true_pieces: Vec<Piece> =
         truth.iter().enumerate().flat_map(|(of, change)| pieces_of_truth(of, change)).collect();
     let reports: Vec<Piece> =
         reported.iter().enumerate().flat_map(|(of, change)| pieces_of_report(of, change)).collect();
-    let recalled = true_pieces.iter().filter(|piece| reports.iter().any(|report| tells_of(report, piece)));
+    let asked: Vec<&Piece> = true_pieces.iter().filter(|piece| truth[piece.of].asked).collect();
+    let recalled = asked.iter().filter(|piece| reports.iter().any(|report| tells_of(report, piece)));
     // A move is one report of two senses; its old place is not told, and only the new one can be wrong.
     let told: Vec<&Piece> = reports.iter().filter(|report| report.reach_m <= NEAR_M).collect();
     let wrong: Vec<&&Piece> =
@@ -83,16 +90,17 @@ pub fn score_changes(reported: &[MapChange], truth: &[TrueChange], starts: &[Tim
     let mut latencies: Vec<f64> = truth
         .iter()
         .enumerate()
+        .filter(|(_, change)| change.asked)
         .filter_map(|(of, change)| {
             let own = true_pieces.iter().filter(|piece| piece.of == of);
             let noticed = own.flat_map(|piece| reports.iter().filter(|report| tells_of(report, piece)));
             let first = noticed.map(|report| report.time).min()?;
-            Some(starts.iter().filter(|start| **start > change.time && **start <= first).count() as f64)
+            Some(change.in_view.iter().filter(|start| **start > change.time && **start <= first).count() as f64)
         })
         .collect();
     ChangeScore {
-        true_pieces: true_pieces.len(),
-        recall: share(recalled.count(), true_pieces.len()),
+        true_pieces: asked.len(),
+        recall: share(recalled.count(), asked.len()),
         reported_pieces: told.len(),
         precision: share(told.len() - wrong.len(), told.len()),
         false_removals: wrong.iter().filter(|report| report.sense == Sense::Went).count(),
@@ -105,13 +113,16 @@ fn share(part: usize, of: usize) -> f64 {
 }
 
 fn tells_of(report: &Piece, truth: &Piece) -> bool {
+    let offset = (report.middle - truth.middle).xy();
     report.sense == truth.sense
         && report.time >= truth.time
-        && (report.middle - truth.middle).xy().norm() <= report.reach_m.hypot(0.5 * PIECE_M)
+        && offset.dot(&truth.direction).abs() < PIECE_M
+        && offset.perp(&truth.direction).abs() <= report.reach_m
 }
 
 fn pieces_of_truth(of: usize, change: &TrueChange) -> Vec<Piece> {
-    let piece = |sense| move |middle| Piece { middle, sense, time: change.time, reach_m: NEAR_M, of };
+    let piece =
+        |sense| move |(middle, direction)| Piece { middle, direction, sense, time: change.time, reach_m: NEAR_M, of };
     let went = middles(&change.went).into_iter().map(piece(Sense::Went));
     went.chain(middles(&change.came).into_iter().map(piece(Sense::Came))).collect()
 }
@@ -125,26 +136,36 @@ fn pieces_of_report(of: usize, change: &MapChange) -> Vec<Piece> {
     let middles = middles(&change.points);
     let piece = |(sense, reach_m): &(Sense, f64)| {
         let (sense, reach_m) = (*sense, *reach_m);
-        middles.iter().map(move |middle| Piece { middle: *middle, sense, time: change.noticed, reach_m, of })
+        let piece = move |(middle, direction): &(Point3<f64>, Vector2<f64>)| Piece {
+            middle: *middle,
+            direction: *direction,
+            sense,
+            time: change.noticed,
+            reach_m,
+            of,
+        };
+        middles.iter().map(piece)
     };
     senses.iter().flat_map(piece).collect()
 }
 
-/// The middles of the pieces of a line; at least one where it has a length.
-fn middles(line: &[Point3<f64>]) -> Vec<Point3<f64>> {
+/// The middles of the pieces of a line and its direction there; at least one where it has a length.
+fn middles(line: &[Point3<f64>]) -> Vec<(Point3<f64>, Vector2<f64>)> {
     let mut middles = Vec::new();
     let mut next_m = 0.5 * PIECE_M;
     let mut way_m = 0.0;
+    let direction = |pair: &[Point3<f64>]| (pair[1] - pair[0]).xy().try_normalize(1e-9).unwrap_or_default();
     for pair in line.windows(2) {
         let length_m = nalgebra::distance(&pair[0], &pair[1]);
         while length_m > 0.0 && next_m <= way_m + length_m {
-            middles.push(pair[0] + (pair[1] - pair[0]) * ((next_m - way_m) / length_m));
+            middles.push((pair[0] + (pair[1] - pair[0]) * ((next_m - way_m) / length_m), direction(pair)));
             next_m += PIECE_M;
         }
         way_m += length_m;
     }
     if middles.is_empty() && line.len() > 1 {
-        middles.push(line[line.len() / 2]);
+        let half = line.len() / 2;
+        middles.push((line[half], direction(&line[half - 1..=half])));
     }
     middles
 }
@@ -161,6 +182,11 @@ mod tests {
         (from_m..=to_m).map(|x| Point3::new(f64::from(x), left_m, 0.0)).collect()
     }
 
+    fn truth(went: Vec<Point3<f64>>, came: Vec<Point3<f64>>) -> TrueChange {
+        let in_view = (0..6).map(|drive| TimestampNs(10 * drive)).collect();
+        TrueChange { time: TimestampNs(15), went, came, in_view, asked: true }
+    }
+
     fn report(kind: ChangeKind, points: Vec<Point3<f64>>, noticed: i64) -> MapChange {
         let id = FusedLaneId { started: TimestampNs(0), drive: DriveId(0), lane: LaneId(1), piece: 0, stretch: 0 };
         let noticed = TimestampNs(noticed);
@@ -169,32 +195,46 @@ mod tests {
 
     #[test]
     fn half_of_a_change_that_is_noticed_two_drives_later_is_half_recalled_at_full_precision() {
-        let truth = [TrueChange { time: TimestampNs(15), went: along(0, 100, 3.5), came: Vec::new() }];
-        let starts: Vec<TimestampNs> = (0..6).map(|drive| TimestampNs(10 * drive)).collect();
-        let score = score_changes(&[report(ChangeKind::Vanished, along(0, 50, 3.4), 30)], &truth, &starts);
+        let truth = [truth(along(0, 100, 3.5), Vec::new())];
+        let score = score_changes(&[report(ChangeKind::Vanished, along(0, 50, 3.4), 30)], &truth);
         assert_eq!((score.true_pieces, score.reported_pieces), (10, 5));
-        assert!((score.recall - 0.55).abs() < 0.06 && (score.precision - 1.0).abs() < 1e-9, "{score:?}");
+        assert!((score.recall - 0.5).abs() < 1e-9 && (score.precision - 1.0).abs() < 1e-9, "{score:?}");
         assert!((score.latency_drives_p50 - 2.0).abs() < 1e-9, "{score:?}");
     }
 
     #[test]
     fn what_did_not_happen_or_had_not_yet_is_wrong() {
-        let truth = [TrueChange { time: TimestampNs(15), went: along(0, 100, 3.5), came: Vec::new() }];
+        let truth = [truth(along(0, 100, 3.5), Vec::new())];
         let reports = [
             report(ChangeKind::Vanished, along(0, 100, 3.5), 10),
             report(ChangeKind::Vanished, along(300, 400, 3.5), 30),
             report(ChangeKind::Appeared, along(0, 100, 3.5), 30),
         ];
-        let score = score_changes(&reports, &truth, &[]);
+        let score = score_changes(&reports, &truth);
         assert!(score.recall < 1e-9 && score.precision < 1e-9, "{score:?}");
         assert_eq!((score.reported_pieces, score.false_removals), (30, 20));
     }
 
     #[test]
     fn a_move_tells_where_paint_came_and_where_it_went() {
-        let truth = [TrueChange { time: TimestampNs(15), went: along(0, 100, 0.0), came: along(0, 100, 1.0) }];
-        let score = score_changes(&[report(ChangeKind::Moved { by_m: 1.0 }, along(0, 100, 1.0), 30)], &truth, &[]);
+        let truth = [truth(along(0, 100, 0.0), along(0, 100, 1.0))];
+        let score = score_changes(&[report(ChangeKind::Moved { by_m: 1.0 }, along(0, 100, 1.0), 30)], &truth);
         assert!((score.recall - 1.0).abs() < 1e-9 && (score.precision - 1.0).abs() < 1e-9, "{score:?}");
         assert_eq!(score.reported_pieces, 10);
+    }
+
+    #[test]
+    fn what_is_not_asked_is_not_missed_and_may_be_reported() {
+        let hardly_seen = TrueChange { asked: false, ..truth(along(0, 100, 3.5), Vec::new()) };
+        let score = score_changes(&[report(ChangeKind::Vanished, along(0, 50, 3.4), 30)], &[hardly_seen]);
+        assert_eq!((score.true_pieces, score.reported_pieces), (0, 5));
+        assert!((score.recall - 1.0).abs() < 1e-9 && (score.precision - 1.0).abs() < 1e-9, "{score:?}");
+    }
+
+    #[test]
+    fn a_report_in_the_next_lane_is_wrong() {
+        let truth = [truth(along(0, 100, 3.5), Vec::new())];
+        let score = score_changes(&[report(ChangeKind::Vanished, along(0, 100, 0.0), 30)], &truth);
+        assert!(score.recall < 1e-9 && score.precision < 1e-9, "{score:?}");
     }
 }

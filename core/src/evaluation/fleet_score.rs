@@ -51,6 +51,8 @@ pub struct FleetScore {
     pub precision: f64,
     /// Length of the map's lines, metres.
     pub length_m: f64,
+    /// The rigid motion that lays the map on the truth.
+    pub motion: RigidMotion,
 }
 
 /// A sample of a line: place and direction in plan.
@@ -66,8 +68,8 @@ struct Samples {
 }
 
 /// A turn about the vertical at a pivot, a shift and a lift.
-#[derive(Clone, Copy)]
-struct RigidMotion {
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RigidMotion {
     pivot: Point3<f64>,
     shift: Vector3<f64>,
     yaw_rad: f64,
@@ -107,6 +109,7 @@ pub fn score_fleet(map: &[Vec<Point3<f64>>], truth: &[Vec<Point3<f64>>]) -> Opti
         coverage: covered as f64 / truth.all.len() as f64,
         precision: right as f64 / fused.len() as f64,
         length_m: fused.len() as f64 * STEP_M,
+        motion,
     })
 }
 
@@ -186,7 +189,9 @@ impl Samples {
 }
 
 impl RigidMotion {
-    fn apply(&self, place: &Point3<f64>) -> Point3<f64> {
+    /// Where it moves a place.
+    #[must_use]
+    pub fn apply(&self, place: &Point3<f64>) -> Point3<f64> {
         let offset = place - self.pivot;
         let (sin, cos) = self.yaw_rad.sin_cos();
         let turned = Vector3::new(cos * offset.x - sin * offset.y, sin * offset.x + cos * offset.y, offset.z);

@@ -120,7 +120,7 @@ impl Fusion<'_> {
                     place: line.points[knot],
                     lateral_variance_m2: 1.0 / mean.across_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
                     height_variance_m2: 1.0 / mean.height_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
-                    record: KnotRecord { drives: line.knots[knot].drives(), belief: beliefs[knot] },
+                    record: KnotRecord { drives: line.knots[knot].drives(), belief: Some(beliefs[knot]) },
                 }
             });
             lines.push(BaseLine {

@@ -1,7 +1,7 @@
 //! Change: what is on the road now that was not, and what was and is no more.
 //!
-//! Every knot of every line has a belief that it is there (`persistence`). Where the belief turns, neighbouring knots
-//! that turned with the same few drives are one event. A stretch that went beside one that came, at most 2.5 m
+//! Every knot of every line has a most likely history (`history`). Neighbouring knots that came, or went, are one event, noticed
+//! with the drive by which half of them were believed. A stretch that went beside one that came, at most 2.5 m
 //! across, was moved. The probability of an event is the mean of its knots'.
 //!
 //! Not guaranteed: a move by less than about 0.7 m, which matching takes for the error of a drive, and a new category on
@@ -13,8 +13,9 @@ use serde::{Deserialize, Serialize};
 use super::{
     contribution::DriveId,
     fusion::Fusion,
+    history::{Belief, Turn},
     line::{FusedLaneId, Lines},
-    persistence::{Belief, Speaker, Turn},
+    persistence::Speaker,
 };
 use crate::frame::TimestampNs;
 
@@ -62,9 +63,9 @@ struct Stretch {
     turn: Turn,
     first: usize,
     last: usize,
-    noticed: Speaker,
+    /// With whom each of its knots came to be believed.
+    noticed: Vec<Speaker>,
     probability_sum: f64,
-    knots: usize,
 }
 
 impl Fusion<'_> {
@@ -74,7 +75,7 @@ impl Fusion<'_> {
         for (line, beliefs) in beliefs.iter().enumerate() {
             stretches.extend(stretches_of(line, beliefs));
         }
-        stretches.retain(|stretch| stretch.knots >= LEAST_KNOTS);
+        stretches.retain(|stretch| stretch.noticed.len() >= LEAST_KNOTS);
         let mut changes = events(&self.lines, &stretches);
         changes.sort_by_key(|change| (change.noticed, change.noticed_by, change.lane));
         changes
@@ -89,18 +90,16 @@ fn stretches_of(line: usize, beliefs: &[Belief]) -> Vec<Stretch> {
         match stretches.last_mut() {
             Some(open) if open.turn == turn && knot - open.last <= BRIDGED_KNOTS + 1 => {
                 open.last = knot;
-                open.noticed = open.noticed.max(noticed);
+                open.noticed.push(noticed);
                 open.probability_sum += probability;
-                open.knots += 1;
             }
             _ => stretches.push(Stretch {
                 line,
                 turn,
                 first: knot,
                 last: knot,
-                noticed,
+                noticed: vec![noticed],
                 probability_sum: probability,
-                knots: 1,
             }),
         }
     }
@@ -132,14 +131,17 @@ fn events(lines: &Lines, stretches: &[Stretch]) -> Vec<MapChange> {
 
 fn change(lines: &Lines, stretch: &Stretch, kind: ChangeKind) -> MapChange {
     let line = &lines.lines[stretch.line];
-    let (noticed, noticed_by) = stretch.noticed;
+    let mut speakers = stretch.noticed.clone();
+    speakers.sort_unstable();
+    // Its ends are told apart last: it is there once half of it is.
+    let (noticed, noticed_by) = speakers[speakers.len() / 2];
     MapChange {
         kind,
         lane: line.id,
         points: line.points[stretch.first..=stretch.last].to_vec(),
         noticed,
         noticed_by,
-        probability: stretch.probability_sum / stretch.knots as f64,
+        probability: stretch.probability_sum / stretch.noticed.len() as f64,
     }
 }
 
@@ -152,5 +154,5 @@ fn distance_m(lines: &Lines, a: &Stretch, b: &Stretch) -> Option<f64> {
     });
     // Knots of the two lie beside each other to within half a chord.
     let near: Vec<f64> = nearest.filter(|distance| *distance <= MOVED_M + 1.5).collect();
-    (2 * near.len() >= a.knots).then(|| near.iter().sum::<f64>() / near.len() as f64)
+    (2 * near.len() >= a.noticed.len()).then(|| near.iter().sum::<f64>() / near.len() as f64)
 }

@@ -17,8 +17,8 @@ use super::{
     alignment::robust_weight,
     contribution::DriveId,
     correction::Correction,
+    history::Belief,
     params::FleetParams,
-    persistence::Belief,
     prepared::{PreparedLane, normal_of},
 };
 use crate::{
@@ -148,7 +148,8 @@ pub(super) struct LineRecord {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct KnotRecord {
     pub(super) drives: u32,
-    pub(super) belief: Belief,
+    /// `None` of a knot that none of them had.
+    pub(super) belief: Option<Belief>,
 }
 
 /// All lines, and which run near a place.

@@ -1,146 +1,223 @@
-//! Persistence: whether a stretch of line is there, from the drives that saw it, that missed it, and that could not see it.
+//! Persistence: what each drive says of each stretch of line: that it saw it, that it missed it while it was in view, or nothing.
 //!
-//! A two-state filter per knot, after Rosen, Mason and Leonard, *Towards Lifelong Feature-Based Mapping in Semi-Static
-//! Environments* (ICRA 2016), with a constant hazard per drive in place of their survival prior. With `p` the
-//! probability that the paint is there, each drive in the order of time first lets it come or go, `p <- p (1 - h) + (1 - p) b`, and
-//! then speaks: `odds(p) *= P(what it says | there) / P(what it says | not there)`. A drive that did not have the knot
-//! in view says nothing.
+//! A pass has a knot in view if its camera was within range and angle of it, unhidden, at [`LEAST_VIEWS`] places of its
+//! way. How likely it then has the line among its lanes depends on how far to the side it was and from how many places it was in
+//! view: this is learned from the drives themselves, by how often passes see what others saw before and after them. A line
+//! that is worn, or painted on bad ground, is missed more often by all, which is learned too.
 //!
-//! A drive has a knot in view if its camera was within range and angle of it, unhidden, at [`LEAST_VIEWS`] places of its way.
+//! A pass whose own lane lies beside the knot, nearer than two lines lie, saw the same paint on another line: it says nothing.
+//! What follows from it all is found in [`history`](super::history).
 
 use nalgebra::{Point3, Vector3};
 
-use serde::{Deserialize, Serialize};
-
-use super::{contribution::DriveId, correction::Correction, line::Lines, prepared::PreparedPass};
+use super::{
+    contribution::DriveId,
+    correction::Correction,
+    fusion::Fusion,
+    history::{Belief, histories},
+    line::Lines,
+    prepared::{PreparedPass, normal_of},
+};
 use crate::{frame::TimestampNs, sensor::Sensor};
 
-/// What a drive says of a knot.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Evidence {
-    /// It has it among its lanes.
-    Seen,
-    /// It had it in view, and has no such lane.
-    Missed,
-}
-
-/// Probability that a line that is there is among a drive's lanes, near the vehicle's own lane.
-const SEEN_NEAR: f64 = 0.9;
-/// The same farther to the side.
-const SEEN_FAR: f64 = 0.65;
-/// Probability that a drive has a lane where there is none.
-const SEEN_GHOST: f64 = 0.05;
-/// Probability that a line goes, and that one comes, between two drives.
-const HAZARD: f64 = 0.01;
-/// Probability from which on a knot is believed to be there.
-const STANDS: f64 = 0.75;
-/// Probability below which it is believed to be gone.
-const GONE: f64 = 0.5;
-/// Passes that must have missed a knot before it can be said to have come.
-const LEAST_MISSED: u32 = 2;
-/// Distance to the side from which a line counts as far, metres.
-const FAR_M: f64 = 6.0;
 /// Nearest and farthest place ahead at which a line is expected to be seen, metres.
 const AHEAD_M: std::ops::Range<f64> = 5.0..35.0;
 /// Farthest place to the side at which a line is expected to be seen, metres.
 const SIDE_M: f64 = 13.0;
 /// Places of the way from which a knot must be in view.
-pub(super) const LEAST_VIEWS: u16 = 3;
-
-/// How one drive had each knot in view.
-#[derive(Clone, Debug)]
-pub(super) struct Views {
-    /// Per line and knot: from how many places, and the least distance to the side.
-    pub(super) of: Vec<Vec<(u16, f32)>>,
-}
+const LEAST_VIEWS: u16 = 3;
+/// Places of the way from which on a knot is well in view.
+const MANY_VIEWS: u16 = 5;
+/// Borders of the classes of distance to the side, metres.
+const SIDES_M: [f64; 4] = [4.0, 8.0, 10.0, 11.5];
+/// Probability that a pass has a line among its lanes, by the class of distance to the side, until the drives tell it.
+const USUAL: [f64; SIDES_M.len() + 1] = [0.97, 0.95, 0.85, 0.6, 0.25];
+/// Knots that the usual probabilities count for.
+const USUAL_KNOTS: f64 = 150.0;
+/// Knots that a line counts for as one like the others.
+const LIKE_OTHERS_KNOTS: f64 = 60.0;
+/// Knots to each side of one that tell how well it is seen there.
+const AROUND_KNOTS: usize = 10;
+/// Distance across within which a pass' own lane is the same paint, metres.
+const SAME_PAINT_M: f64 = 0.6;
+/// Distance along within which a knot of another line is the same place, with that across, metres.
+const SAME_KNOT_M: f64 = 2.6;
+/// Distance across within which there is hardly room for another line: detectors waver beside a line, metres.
+const NO_ROOM_M: f64 = 2.3;
+/// Probability that a pass has a lane where there is none.
+const GHOST: f64 = 0.03;
+/// The same beside a line that more drives saw.
+const GHOST_BESIDE: f64 = 0.15;
 
 /// Who says something of a knot, and when: a drive and its start.
 pub(super) type Speaker = (TimestampNs, DriveId);
 
-/// Belief that a knot is there, and what became of it.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Belief {
-    pub(super) probability: f64,
-    /// Passes that saw it.
-    seen: u32,
-    /// Passes that missed it since.
-    missed: u32,
-    /// Passes that missed it before any saw it.
-    missed_before: u32,
-    /// Whether it was believed to be there, and not since to be gone.
-    stands: bool,
-    /// Start of the last drive that saw it.
-    pub(super) confirmed: Option<TimestampNs>,
-    /// The last change, and the drive that made it believed.
-    pub(super) change: Option<(Turn, Speaker)>,
+/// What one pass says of a knot that it had in view, or saw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Hearing {
+    /// Number of the pass among those of all drives, which is their order in time.
+    pub(super) pass: u32,
+    /// Whether it has it among its lanes.
+    pub(super) seen: bool,
+    /// Probability that it has, if the line is there.
+    pub(super) chance: f64,
+    /// The same if it is not.
+    pub(super) ghost: f64,
 }
 
-/// What becomes of a knot.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) enum Turn {
-    /// It is there, where it was not.
-    Came,
-    /// It is there no more.
-    Went,
+/// How a pass had a knot in view.
+#[derive(Clone, Copy, Debug, Default)]
+struct View {
+    /// From how many places of its way.
+    places: u16,
+    /// Least distance to the side, metres.
+    side_m: f32,
 }
 
-impl Default for Belief {
-    /// Before any drive.
-    fn default() -> Self {
-        Self { probability: 0.5, seen: 0, missed: 0, missed_before: 0, stands: false, confirmed: None, change: None }
+/// A hearing before its chance is known.
+#[derive(Clone, Copy, Debug)]
+struct Sight {
+    pass: u32,
+    seen: bool,
+    class: usize,
+}
+
+impl Fusion<'_> {
+    /// What became of each knot of each line.
+    pub(super) fn beliefs(&self) -> Vec<Vec<Belief>> {
+        let mut speakers: Vec<Speaker> = Vec::new();
+        let mut sights: Vec<Vec<Vec<Sight>>> =
+            self.lines.lines.iter().map(|line| vec![Vec::new(); line.knots.len()]).collect();
+        for (drive, number, pass) in self.passes() {
+            let contribution = self.drives[drive].contribution;
+            speakers.resize(number + 1, contribution.seniority());
+            let views = views(pass, &contribution.sensor, &self.corrections[drive], &self.lines);
+            self.look(number, &views, &mut sights);
+        }
+        let chances = learned_chances(&sights);
+        let beliefs = sights.iter().enumerate().map(|(index, sights)| {
+            let line = &self.lines.lines[index];
+            let worn = worn(sights, &chances);
+            let hearings: Vec<Vec<Hearing>> = (0..sights.len())
+                .map(|knot| {
+                    let ghost = if self.is_beside_a_stronger_line(index, knot) { GHOST_BESIDE } else { GHOST };
+                    let hearing = |sight: &Sight| Hearing {
+                        pass: sight.pass,
+                        seen: sight.seen,
+                        chance: worn[knot] * chances[sight.class],
+                        ghost,
+                    };
+                    sights[knot].iter().map(hearing).collect()
+                })
+                .collect();
+            let before: Vec<Option<Belief>> = line.knots.iter().map(|knot| knot.record.belief).collect();
+            histories(&before, &hearings, &speakers)
+        });
+        beliefs.collect()
     }
-}
 
-impl Belief {
-    /// Takes what the next drive says.
-    pub(super) fn hear(&mut self, evidence: Evidence, to_the_side_m: f64, speaker: Speaker) {
-        let coming = self.probability * (1.0 - HAZARD) + (1.0 - self.probability) * HAZARD;
-        let seen = self.chance_of_sight(if to_the_side_m < FAR_M { SEEN_NEAR } else { SEEN_FAR });
-        let (there, not_there) = match evidence {
-            Evidence::Seen => (seen, SEEN_GHOST),
-            Evidence::Missed => (1.0 - seen, 1.0 - SEEN_GHOST),
-        };
-        self.probability = coming * there / (coming * there + (1.0 - coming) * not_there);
-        match evidence {
-            Evidence::Seen => {
-                self.seen += 1;
-                self.confirmed = Some(speaker.0);
+    /// What one pass saw and missed.
+    fn look(&self, number: usize, views: &[Vec<View>], sights: &mut [Vec<Vec<Sight>>]) {
+        let Ok(pass) = u32::try_from(number) else { return };
+        for (index, (line, views)) in self.lines.lines.iter().zip(views).enumerate() {
+            for (knot, (at, view)) in line.knots.iter().zip(views).enumerate() {
+                let seen = at.witnesses.iter().any(|witness| witness.pass == number);
+                if seen || (view.places >= LEAST_VIEWS && !self.sees_paint_beside(number, index, knot)) {
+                    sights[index][knot].push(Sight { pass, seen, class: class_of(*view) });
+                }
             }
-            Evidence::Missed if self.seen == 0 => self.missed_before += 1,
-            Evidence::Missed => self.missed += 1,
         }
-        self.turn(speaker);
     }
 
-    /// Probability that a pass sees it if it is there: by how often it was seen, once several have. A worn line, or one
-    /// across the oncoming lane, is missed often by all.
-    fn chance_of_sight(&self, usual: f64) -> f64 {
-        const KNOWN: u32 = 3;
-        const WEIGHT: f64 = 4.0;
-        if self.seen < KNOWN {
-            return usual;
-        }
-        let passes = f64::from(self.seen + self.missed);
-        ((f64::from(self.seen) + WEIGHT * usual) / (passes + WEIGHT)).clamp(0.25, 0.97)
+    /// Whether more drives saw a line so near a knot that there is hardly room for two.
+    fn is_beside_a_stronger_line(&self, line: usize, knot: usize) -> bool {
+        let place = self.lines.lines[line].points[knot];
+        let normal = normal_of(&self.lines.lines[line].tangent(knot));
+        let own = self.lines.lines[line].knots[knot].drives();
+        let mut beside = false;
+        self.lines.for_each_knot_near(&place, NO_ROOM_M, |other, at, there| {
+            let across_m = (there - place).xy().dot(&normal).abs();
+            let is_near = (there - place).xy().norm() < NO_ROOM_M && across_m > SAME_PAINT_M;
+            if !beside && is_near && other != line {
+                beside = self.lines.lines[other].knots[at].drives() > own;
+            }
+        });
+        beside
     }
 
-    /// Notes a change, once it is believed. That a line is there is none where nobody passed before.
-    fn turn(&mut self, speaker: Speaker) {
-        if !self.stands && self.probability >= STANDS {
-            self.stands = true;
-            let was_missing = self.missed_before >= LEAST_MISSED || self.change.is_some();
-            self.change = was_missing.then_some((Turn::Came, speaker));
-        } else if self.stands && self.probability < GONE {
-            self.stands = false;
-            // What one drive saw was not believed by others: it was never there.
-            self.change = (self.seen > 1).then_some((Turn::Went, speaker));
-        }
+    /// Whether a pass has the paint of a knot on another line.
+    fn sees_paint_beside(&self, number: usize, line: usize, knot: usize) -> bool {
+        let place = self.lines.lines[line].points[knot];
+        let normal = normal_of(&self.lines.lines[line].tangent(knot));
+        let mut beside = false;
+        self.lines.for_each_knot_near(&place, 3.0, |other, at, _| {
+            if beside || other == line {
+                return;
+            }
+            let own = self.lines.lines[other].knots[at].witnesses.iter().filter(|witness| witness.pass == number);
+            let mut offsets = own.map(|witness| (witness.shared - place).xy());
+            beside = offsets.any(|offset| offset.dot(&normal).abs() < SAME_PAINT_M && offset.norm() < SAME_KNOT_M);
+        });
+        beside
     }
 }
 
-/// Which knots a pass had in view.
-pub(super) fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Correction, lines: &Lines) -> Views {
-    let mut of: Vec<Vec<(u16, f32)>> = lines.lines.iter().map(|line| vec![(0, f32::MAX); line.points.len()]).collect();
+fn class_of(view: View) -> usize {
+    let side = SIDES_M.iter().position(|limit_m| f64::from(view.side_m) < *limit_m).unwrap_or(SIDES_M.len());
+    2 * side + usize::from(view.places >= MANY_VIEWS)
+}
+
+/// Passes that saw or missed a knot between the first and the last that saw it: there it surely was.
+fn while_there(knot: &[Sight]) -> &[Sight] {
+    let first = knot.iter().position(|sight| sight.seen);
+    let last = knot.iter().rposition(|sight| sight.seen);
+    match (first, last) {
+        (Some(first), Some(last)) if first + 1 < last => &knot[first + 1..last],
+        _ => &[],
+    }
+}
+
+/// Probability of each class that a pass sees what is there.
+fn learned_chances(sights: &[Vec<Vec<Sight>>]) -> Vec<f64> {
+    /// Passes that must have seen a knot for it to be one to learn from.
+    const LEAST_SEEN: usize = 4;
+    let mut counts: Vec<(f64, f64)> = (0..2 * USUAL.len())
+        .map(|class| {
+            let usual = USUAL[class / 2] * if class % 2 == 0 { 0.9 } else { 1.0 };
+            (usual * USUAL_KNOTS, USUAL_KNOTS)
+        })
+        .collect();
+    let known = sights.iter().flatten().filter(|knot| knot.iter().filter(|sight| sight.seen).count() >= LEAST_SEEN);
+    for sight in known.flat_map(|knot| while_there(knot)) {
+        let (seen, all) = &mut counts[sight.class];
+        *seen += f64::from(u8::from(sight.seen));
+        *all += 1.0;
+    }
+    counts.into_iter().map(|(seen, all)| seen / all).collect()
+}
+
+/// By how much less often a line is seen about each of its knots than others are.
+fn worn(sights: &[Vec<Sight>], chances: &[f64]) -> Vec<f64> {
+    let mut sums = vec![(0.0, 0.0)];
+    for knot in sights {
+        let (mut seen, mut expected) = sums[sums.len() - 1];
+        for sight in while_there(knot) {
+            seen += f64::from(u8::from(sight.seen));
+            expected += chances[sight.class];
+        }
+        sums.push((seen, expected));
+    }
+    let around = |knot: usize| {
+        let (from, to) = (sums[knot.saturating_sub(AROUND_KNOTS)], sums[(knot + AROUND_KNOTS + 1).min(sights.len())]);
+        ((LIKE_OTHERS_KNOTS + to.0 - from.0) / (LIKE_OTHERS_KNOTS + to.1 - from.1)).min(1.0)
+    };
+    (0..sights.len()).map(around).collect()
+}
+
+/// How a pass had each knot of each line in view.
+fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Correction, lines: &Lines) -> Vec<Vec<View>> {
+    let mut of: Vec<Vec<View>> =
+        lines.lines.iter().map(|line| vec![View { places: 0, side_m: f32::MAX }; line.points.len()]).collect();
     for point in pass.way {
         let place = correction.apply(&point.position, point.arc_m);
         let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
@@ -153,49 +230,13 @@ pub(super) fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Corre
                 return;
             }
             if sensor.sees(&Point3::new(ahead, left, offset.z)) && !point.hides(ahead, left, sensor) {
-                let (views, side_m) = &mut of[line][knot];
-                *views += 1;
+                let view = &mut of[line][knot];
+                view.places += 1;
                 #[expect(clippy::cast_possible_truncation, reason = "metres to the side")]
                 let left_m = left.abs() as f32;
-                *side_m = side_m.min(left_m);
+                view.side_m = view.side_m.min(left_m);
             }
         });
     }
-    Views { of }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    use Evidence::{Missed, Seen};
-
-    fn after(evidence: &[Evidence]) -> Belief {
-        let mut belief = Belief::default();
-        for (number, evidence) in (0..).zip(evidence) {
-            belief.hear(*evidence, 2.0, (TimestampNs(number), DriveId(0)));
-        }
-        belief
-    }
-
-    #[test]
-    fn one_drive_suffices_until_others_miss_what_it_saw() {
-        assert!(after(&[Seen]).probability > 0.9);
-        assert!(after(&[Seen, Missed, Missed]).probability < 0.5);
-        assert!(after(&[Seen, Seen, Missed, Seen]).probability > 0.9);
-        assert_eq!(after(&[Seen, Missed, Missed]).change, None, "a ghost is no change");
-    }
-
-    #[test]
-    fn a_line_that_goes_is_given_up_within_three_drives_and_one_that_comes_is_noticed_within_two() {
-        let mut drives = vec![Seen; 30];
-        drives.extend([Missed; 3]);
-        let (turn, (when, _)) = after(&drives).change.unwrap();
-        assert!(turn == Turn::Went && when.0 < 33);
-        let mut drives = vec![Missed; 10];
-        drives.extend([Seen; 2]);
-        let (turn, (when, _)) = after(&drives).change.unwrap();
-        assert!(turn == Turn::Came && when.0 < 12);
-        assert_eq!(after(&[Seen; 5]).change, None);
-    }
+    of
 }

@@ -217,29 +217,22 @@ fn likelihoods(votes: &[Vote<'_>], square: Square, prior_sigma_m: f64, params: &
 /// The most probable state of each window.
 fn most_probable(windows: &[Likelihood], square: Square, params: &FleetParams) -> Vec<usize> {
     let drift_m2 = params.odometry_sigma_m.powi(2) * WINDOW_M + 0.15_f64.powi(2);
-    let steps: Vec<(isize, isize, f64)> = (-1..=1_isize)
-        .flat_map(|east| (-1..=1_isize).map(move |north| (east, north)))
-        .map(|(east, north)| {
-            let jump_m2 = ((east * east + north * north) as f64) * STEP_M * STEP_M;
-            (east, north, -0.5 * jump_m2 / drift_m2)
-        })
-        .collect();
+    // A jump costs the sum of what its two axes cost: the best is found along one, then along the other.
+    let jump = -0.5 * STEP_M * STEP_M / drift_m2;
     let mut score = vec![0.0; square.count()];
     let mut from: Vec<Vec<usize>> = Vec::with_capacity(windows.len());
+    let (mut by_east, mut east_from) = (vec![0.0; square.count()], vec![0; square.count()]);
     for window in windows {
-        let next = (0..square.count()).map(|state| {
-            let before = steps.iter().filter_map(|(east, north, cost)| {
-                let before = square.moved(state, *east, *north)?;
-                Some((score[before] + cost, before))
-            });
-            before.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((score[state], state))
-        });
-        let (reached, before): (Vec<f64>, Vec<usize>) = next.unzip();
-        score = reached;
+        best_of_three(&score, 1, square.width(), jump, &mut by_east, &mut east_from);
+        let mut north_from = vec![0; square.count()];
+        best_of_three(&by_east, square.width(), square.count(), jump, &mut score, &mut north_from);
+        for before in &mut north_from {
+            *before = east_from[*before];
+        }
         for (score, own) in score.iter_mut().zip(window) {
             *score += own;
         }
-        from.push(before);
+        from.push(north_from);
     }
     let mut state = (0..square.count()).max_by(|a, b| score[*a].total_cmp(&score[*b])).unwrap_or(0);
     let mut path = vec![0; windows.len()];
@@ -248,6 +241,28 @@ fn most_probable(windows: &[Likelihood], square: Square, params: &FleetParams) -
         state = from[window][state];
     }
     path
+}
+
+/// For each state the best of itself and its two neighbours so many states away, which cost a jump, and which it is. There is
+/// no neighbour over the border of a row of `row` states.
+fn best_of_three(score: &[f64], step: usize, row: usize, jump: f64, best: &mut [f64], of: &mut [usize]) {
+    best.copy_from_slice(score);
+    for (state, of) in of.iter_mut().enumerate() {
+        *of = state;
+    }
+    for start in (0..score.len()).step_by(row) {
+        let row = start..start + row;
+        for state in row.start + step..row.end {
+            if score[state - step] + jump > best[state] {
+                (best[state], of[state]) = (score[state - step] + jump, state - step);
+            }
+        }
+        for state in row.start..row.end - step {
+            if score[state + step] + jump > best[state] {
+                (best[state], of[state]) = (score[state + step] + jump, state + step);
+            }
+        }
+    }
 }
 
 /// Share of the samples that lie on a line, of those that lie on one or where none can be: beside one, within a lane.

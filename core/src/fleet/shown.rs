@@ -8,35 +8,14 @@ use std::{
 use super::{
     base::Base,
     fusion::{FusedDrive, FusedMap, Fusion},
-    line::{BASE, FusedLane, FusedLaneId, FusedPoint, Line, LineRecord},
+    history::Belief,
+    line::{BASE, FusedLane, FusedLaneId, FusedPoint, LineRecord},
     params::FleetParams,
-    persistence::{Belief, Evidence, LEAST_VIEWS, views},
     prepared::{PreparedPass, normal_of},
 };
 use crate::category::Category;
 
 impl Fusion<'_> {
-    /// Probability of each knot of each line to be there.
-    pub(super) fn beliefs(&self) -> Vec<Vec<Belief>> {
-        let of_line = |line: &Line| line.knots.iter().map(|knot| knot.record.belief).collect();
-        let mut beliefs: Vec<Vec<Belief>> = self.lines.lines.iter().map(of_line).collect();
-        for (drive, number, pass) in self.passes() {
-            let contribution = self.drives[drive].contribution;
-            let (sensor, speaker) = (&contribution.sensor, contribution.seniority());
-            let views = views(pass, sensor, &self.corrections[drive], &self.lines);
-            for ((line, beliefs), views) in self.lines.lines.iter().zip(&mut beliefs).zip(&views.of) {
-                for ((knot, belief), (views, side_m)) in line.knots.iter().zip(beliefs).zip(views) {
-                    if knot.witnesses.iter().any(|witness| witness.pass == number) {
-                        belief.hear(Evidence::Seen, f64::from(*side_m), speaker);
-                    } else if *views >= LEAST_VIEWS {
-                        belief.hear(Evidence::Missed, f64::from(*side_m), speaker);
-                    }
-                }
-            }
-        }
-        beliefs
-    }
-
     /// What is known of a line from all drives, those that were folded among them.
     pub(super) fn record_of(&self, index: usize) -> LineRecord {
         let line = &self.lines.lines[index];

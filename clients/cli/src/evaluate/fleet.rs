@@ -1,18 +1,19 @@
 //! `lanemap evaluate fleet`: how a fused map gets better with every drive, on recorded roads and on simulated fleets.
 
 mod contributed;
+mod loop_closure;
 mod plot;
 mod recorded;
 mod report;
 mod simulated;
+mod true_change;
 
 use std::{collections::BTreeSet, path::PathBuf};
 
 use clap::{Args, ValueEnum};
 use lanemap_core::{
-    TimestampNs,
-    evaluation::{ChangeScore, FleetScore, TrueChange, score_changes, score_fleet},
-    fleet::{Contribution, FleetParams, FusedMap, fuse},
+    evaluation::{ChangeScore, FleetScore, TrueChange, fleet_score::RigidMotion, score_changes, score_fleet},
+    fleet::{Contribution, FleetParams, FusedMap, MapChange, fuse},
     geometry::georeference::Anchor,
     lane_map::EndRule,
     spline::{curve::Curve, sampling::sample},
@@ -46,6 +47,9 @@ pub struct FleetArgs {
     /// move, between a quarter and three quarters of the drives
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1000))]
     changes: u32,
+    /// Other vehicles as in a town, which hide parts of the road; changes that are reported are scored, too
+    #[arg(long)]
+    traffic: bool,
     /// Seed of everything random: the same seed gives the same figures
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -90,9 +94,11 @@ pub struct Road {
     pub truth: Vec<Vec<Point3<f64>>>,
     pub anchor: Anchor,
     /// What truly happened to it.
-    pub changes: Vec<TrueChange>,
+    pub changes: Vec<true_change::SeenChange>,
     /// Whether it is asked how well that was noticed.
     pub changes_asked: bool,
+    /// Where the drives truly went, of worlds in which a drive comes back over its own road.
+    pub true_ways: Vec<loop_closure::TrueWay>,
 }
 
 /// The figures of one road at one number of drives: means over the choices of so many.
@@ -110,6 +116,10 @@ pub struct ByDrives {
     pub fuse_ms: f64,
     /// How well changes of the road were noticed, where that is asked.
     pub changes: Option<ChangeScore>,
+    /// How well a drive that came back over its own road lies on itself.
+    pub closure: Option<loop_closure::LoopClosure>,
+    /// Way that the drives took together, metres; mean.
+    pub driven_m: f64,
 }
 
 /// Runs the measure.
@@ -148,17 +158,21 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
     let most = road.contributions.len();
     let choices = if choose && count < most { most } else { 1 };
     let (mut scores, mut apart, mut bytes, mut times, mut kept) = (Vec::new(), 0, 0.0, Vec::new(), None);
-    let mut changes = None;
+    let mut driven_m = 0.0;
+    let (mut changes, mut closure) = (None, None);
     for first in 0..choices {
         let chosen: Vec<Contribution> =
             (0..count).map(|step| road.contributions[(first + step) % most].clone()).collect();
+        driven_m += chosen.iter().filter_map(|drive| drive.trajectory.last()).map(|last| last.arc_m).sum::<f64>();
         let began = std::time::Instant::now();
         let map = fuse(&chosen, &road.anchor, &FleetParams::default());
         times.push(began.elapsed().as_secs_f64() * 1e3);
         apart += map.drives.iter().filter(|drive| drive.correction.is_none()).count();
         bytes += contributed::packed_bytes(&map) as f64;
-        scores.extend(score_fleet(&polylines(&map), &road.truth));
-        changes = road.changes_asked.then(|| noticed(road, &chosen, &map));
+        let score = score_fleet(&polylines(&map), &road.truth);
+        scores.extend(score);
+        changes = score.filter(|_| road.changes_asked).map(|score| noticed(road, &chosen, &map, &score.motion));
+        closure = road.true_ways.iter().find_map(|way| way.closure(&chosen, &map));
         kept = (!choose && count > 1).then(|| kept_names(road, count, &map));
     }
     let choices = choices as f64;
@@ -168,18 +182,23 @@ fn figures_of(road: &Road, count: usize, choose: bool) -> ByDrives {
         apart: apart as f64 / choices,
         kept_names: kept,
         bytes: bytes / choices,
+        closure,
+        driven_m: driven_m / choices,
         fuse_ms: lanemap_core::evaluation::quantile(&mut times, 0.5),
         changes,
     }
 }
 
-/// How well a map tells what happened while its drives were under way.
-fn noticed(road: &Road, drives: &[Contribution], map: &FusedMap) -> ChangeScore {
-    let mut starts: Vec<TimestampNs> = drives.iter().map(|drive| drive.started).collect();
-    starts.sort_unstable();
-    let over = starts.last().copied().unwrap_or_default();
-    let happened: Vec<TrueChange> = road.changes.iter().filter(|change| change.time < over).cloned().collect();
-    score_changes(&map.changes, &happened, &starts)
+/// How well a map tells what happened while its drives were under way; places are compared after the map's one rigid motion.
+fn noticed(road: &Road, drives: &[Contribution], map: &FusedMap, motion: &RigidMotion) -> ChangeScore {
+    let over = drives.iter().map(|drive| drive.started).max().unwrap_or_default();
+    let happened: Vec<TrueChange> =
+        road.changes.iter().filter_map(|change| change.told_until(over)).flatten().collect();
+    let moved = map.changes.iter().map(|change| MapChange {
+        points: change.points.iter().map(|point| motion.apply(point)).collect(),
+        ..change.clone()
+    });
+    score_changes(&moved.collect::<Vec<_>>(), &happened)
 }
 
 /// Share of the names in the map of one drive fewer that this map still has.

@@ -70,7 +70,15 @@ fn road(folder: &Path, name: &str, drives: &[String]) -> anyhow::Result<Road> {
         truth.extend(true_lines(&folder.join("maps").join(drive.name()).with_extension("geojson"), origin)?);
     }
     // What happened to a recorded road is not known.
-    Ok(Road { name: name.to_owned(), contributions, truth, anchor, changes: Vec::new(), changes_asked: false })
+    Ok(Road {
+        name: name.to_owned(),
+        contributions,
+        truth,
+        anchor,
+        changes: Vec::new(),
+        changes_asked: false,
+        true_ways: Vec::new(),
+    })
 }
 
 fn receiver_pose(frame: &DriveFrame) -> anyhow::Result<Pose> {

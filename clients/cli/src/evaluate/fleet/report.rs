@@ -3,7 +3,7 @@
 use lanemap_core::evaluation::{ChangeScore, FleetScore, fleet_score::Quantiles};
 use serde_json::{Value, json};
 
-use super::{ByDrives, FleetArgs, Road};
+use super::{ByDrives, FleetArgs, Road, loop_closure::LoopClosure};
 use crate::evaluate::table::Table;
 
 /// Prints the figures.
@@ -40,8 +40,10 @@ fn as_json(figures: &[(&Road, Vec<ByDrives>)]) -> Value {
             "kept_apart": figure.apart,
             "kept_ids": figure.kept_names,
             "bytes_per_km": 1000.0 * figure.bytes / figure.mean(|score| score.length_m).max(1.0),
+            "driven_km": figure.driven_m / 1e3,
             "fuse_ms": figure.fuse_ms,
             "changes": figure.changes.map(changes_as_json),
+            "loop": figure.closure.map(closure_as_json),
         })
     };
     let roads = figures.iter().map(
@@ -61,14 +63,48 @@ fn changes_as_json(changes: ChangeScore) -> Value {
     })
 }
 
+fn closure_as_json(closure: LoopClosure) -> Value {
+    json!({
+        "places": closure.places,
+        "lateral_m": { "p50": closure.lateral.p50, "p95": closure.lateral.p95 },
+        "height_m": { "p50": closure.height.p50, "p95": closure.height.p95 },
+        "by_odometry_m": closure.by_odometry_m,
+    })
+}
+
+/// How well drives that came back over their own road lie on themselves; nothing where none did.
+fn closures_as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
+    let mut table = Table::new(&["road", "places", "lateral p50", "p95", "height p50", "p95", "apart by odometry"]);
+    let closures = figures.iter().flat_map(|(road, figures)| figures.iter().map(move |figure| (road, figure.closure)));
+    let mut any = false;
+    for (road, closure) in closures {
+        let Some(closure) = closure else { continue };
+        any = true;
+        table.row(vec![
+            road.name.clone(),
+            closure.places.to_string(),
+            format!("{:.3}", closure.lateral.p50),
+            format!("{:.3}", closure.lateral.p95),
+            format!("{:.3}", closure.height.p50),
+            format!("{:.3}", closure.height.p95),
+            format!("{:.1}", closure.by_odometry_m),
+        ]);
+    }
+    let heading = "Places that a drive passed twice: by how much more it is off the second time, metres.";
+    if any { format!("\n{heading}\n\n{}", table.render()) } else { String::new() }
+}
+
 /// How well changes were noticed, a line for each number of drives; nothing where that is not asked.
 fn changes_as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
-    let mut table = Table::new(&["road", "drives", "precision", "recall", "latency p50", "false removals", "pieces"]);
+    let mut table =
+        Table::new(&["road", "drives", "precision", "recall", "latency p50", "false removals", "pieces", "km"]);
     let asked = figures.iter().flat_map(|(road, figures)| figures.iter().map(move |figure| (road, figure)));
-    let mut any = false;
+    let (mut any, mut false_removals, mut driven_m) = (false, 0, 0.0);
     for (road, figure) in asked {
         let Some(changes) = figure.changes else { continue };
         any = true;
+        false_removals += changes.false_removals;
+        driven_m += figure.driven_m;
         table.row(vec![
             road.name.clone(),
             figure.drives.to_string(),
@@ -77,10 +113,12 @@ fn changes_as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
             format!("{:.0}", changes.latency_drives_p50),
             changes.false_removals.to_string(),
             changes.true_pieces.to_string(),
+            format!("{:.0}", figure.driven_m / 1e3),
         ]);
     }
     let heading = "Changes, per piece of 10 m; latency in drives.";
-    if any { format!("\n{heading}\n\n{}", table.render()) } else { String::new() }
+    let sum = format!("{false_removals} false removals in {:.0} km", driven_m / 1e3);
+    if any { format!("\n{heading}\n\n{}\n{sum}\n", table.render()) } else { String::new() }
 }
 
 fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
@@ -122,8 +160,9 @@ fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
         }
     }
     format!(
-        "Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}{}",
+        "Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}{}{}",
         table.render(),
+        closures_as_text(figures),
         changes_as_text(figures)
     )
 }

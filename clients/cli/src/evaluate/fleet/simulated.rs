@@ -1,13 +1,18 @@
 //! Simulated fleets: their drives, mapped, and their true lines.
 
-use lanemap_core::{evaluation::TrueChange, fleet::DriveId};
+use lanemap_core::fleet::DriveId;
 use lanemap_simulator::{
     Seed,
-    fleet::{ChangePlan, Fleet, FleetDrive, FleetScenario, PoisonPlan, RoadChange},
+    fleet::{ChangePlan, Fleet, FleetScenario, PoisonPlan, TrafficModel},
 };
 use nalgebra::Point3;
 
-use super::{FleetArgs, Road, SimulatedFleet, contributed::contribution};
+use super::{
+    FleetArgs, Road, SimulatedFleet,
+    contributed::contribution,
+    loop_closure::true_ways,
+    true_change::{SeenChange, ways},
+};
 use crate::evaluate::parallel;
 
 /// As many worlds as are asked for, each with its drives mapped.
@@ -16,7 +21,7 @@ pub fn worlds(args: &FleetArgs, kind: SimulatedFleet) -> anyhow::Result<Vec<Road
     let seeds: Vec<u64> = (args.seed..args.seed + args.worlds).collect();
     let fleets = seeds.iter().map(|seed| (*seed, scenario(args, kind, most).fleet(Seed(*seed))));
     let fleets: Vec<(u64, Fleet)> = fleets.collect();
-    let asked = args.changes > 0;
+    let asked = args.changes > 0 || args.traffic;
     fleets.iter().map(|(seed, fleet)| world(kind, *seed, fleet, asked)).collect()
 }
 
@@ -32,6 +37,7 @@ fn scenario(args: &FleetArgs, kind: SimulatedFleet, most: Option<u32>) -> FleetS
         drives: most.unwrap_or(named.drives),
         poison: PoisonPlan { gross_share: args.gross, adversarial_share: args.adversarial },
         changes: changes(args.changes, most.unwrap_or(named.drives)),
+        traffic: if args.traffic { TrafficModel::town() } else { named.traffic },
         ..named
     }
 }
@@ -42,26 +48,6 @@ fn changes(each: u32, drives: u32) -> ChangePlan {
     ChangePlan { vanished: each, appeared: each, moved: each, repainted: 0, zones: 0, ..middle }
 }
 
-/// Distance from the way of a drive within which its camera may see a line, metres.
-const IN_VIEW_M: f64 = 30.0;
-
-/// A change, as much of it as lies where drives went.
-fn true_change(change: &RoadChange, ways: &[Point3<f64>]) -> TrueChange {
-    let near = |point: &&Point3<f64>| ways.iter().any(|way| (way - *point).xy().norm() < IN_VIEW_M);
-    let seen = |line: &[Point3<f64>]| line.iter().filter(near).copied().collect();
-    TrueChange { time: change.time, went: seen(&change.before), came: seen(&change.after) }
-}
-
-/// Where the vehicles of a fleet went, every so many frames.
-fn ways(fleet: &Fleet) -> Vec<Point3<f64>> {
-    const STRIDE: usize = 8;
-    let of_drive = |drive: FleetDrive<'_>| {
-        let states = drive.states().iter().step_by(STRIDE);
-        states.map(|state| state.world_from_vehicle.translation.vector.into()).collect::<Vec<_>>()
-    };
-    fleet.drives().flat_map(of_drive).collect()
-}
-
 fn world(kind: SimulatedFleet, seed: u64, fleet: &Fleet, asked: bool) -> anyhow::Result<Road> {
     let numbers: Vec<u32> = (0..fleet.scenario().drives).collect();
     let contributions = parallel::for_each(&numbers, |number| {
@@ -69,7 +55,7 @@ fn world(kind: SimulatedFleet, seed: u64, fleet: &Fleet, asked: bool) -> anyhow:
         Ok(contribution(DriveId(u64::from(*number)), drive.sensor(), drive.frames()))
     })?;
     let ways = if asked { ways(fleet) } else { Vec::new() };
-    let changes = fleet.changes().iter().map(|change| true_change(change, &ways)).collect();
+    let changes = fleet.changes().iter().map(|change| SeenChange::new(change, &ways)).collect();
     let truth = fleet.truth_at(fleet.start_of(fleet.scenario().drives)).lines;
     let truth: Vec<Vec<Point3<f64>>> = truth.into_iter().map(|line| line.points).collect();
     Ok(Road {
@@ -79,5 +65,6 @@ fn world(kind: SimulatedFleet, seed: u64, fleet: &Fleet, asked: bool) -> anyhow:
         anchor: fleet.georeference().anchor,
         changes,
         changes_asked: asked,
+        true_ways: if kind == SimulatedFleet::Loop { true_ways(fleet) } else { Vec::new() },
     })
 }

@@ -10,7 +10,7 @@
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
 //! 5. [`base`]: the oldest drives are folded, so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
-//!    (`persistence`), and the most likely history of each stretch (`history`).
+//!    (`persistence`, `moved`), and the most likely history of each stretch (`history`).
 //! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
 //!
 //! ```
@@ -64,6 +64,7 @@ mod history;
 mod joining;
 pub mod line;
 pub mod matching;
+mod moved;
 pub mod params;
 mod persistence;
 pub mod placement;

@@ -4,8 +4,8 @@
 //! with the drive by which half of them were believed. A stretch that went beside one that came, at most 2.5 m
 //! across, was moved. The probability of an event is the mean of its knots'.
 //!
-//! Not guaranteed: a move by less than about 0.7 m, which matching takes for the error of a drive, and a new category on
-//! a part of a line, which a drive's own map does not tell.
+//! Not guaranteed: a move by less than about half a metre, and a new category on a part of a line, which a drive's own map
+//! does not tell.
 
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};

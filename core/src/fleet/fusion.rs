@@ -319,6 +319,7 @@ impl<'a> Fusion<'a> {
             line.settle(self.params);
             run_on(line, self.params);
         }
+        self.part_moved(&mut pieces);
         self.lines.index();
     }
 

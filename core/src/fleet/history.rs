@@ -41,6 +41,8 @@ pub(super) struct Belief {
     pub(super) probability: f64,
     /// Whether it is held to be there, by the last change that was believed.
     stands: bool,
+    /// Whether most drives have its paint on another line.
+    pub(super) doubled: bool,
     /// Start of the last drive that saw it.
     pub(super) confirmed: Option<TimestampNs>,
     /// The last change, and the drive that made it believed.
@@ -92,7 +94,8 @@ pub(super) fn histories(before: &[Option<Belief>], hearings: &[Vec<Hearing>], sp
             let confirmed = hearings.iter().rev().find(|hearing| hearing.seen);
             let confirmed = confirmed.map(|hearing| speakers[hearing.pass as usize].0);
             Belief {
-                probability: marginal.there.clamp(*FOLDED.start(), *FOLDED.end()),
+                probability: there(marginal, saying, passes.len()).clamp(*FOLDED.start(), *FOLDED.end()),
+                doubled: saying.before.is_some_and(|before| before.doubled),
                 stands: saying.before.map_or(marginal.there >= 0.5, |before| before.stands),
                 confirmed: confirmed.or(saying.before.and_then(|before| before.confirmed)),
                 change: saying.before.and_then(|before| before.change),
@@ -129,6 +132,22 @@ fn saying(before: Option<Belief>, hearings: &[Hearing], passes: &[u32]) -> Sayin
         sum.exp()
     }));
     Saying { before, odds, seen }
+}
+
+/// Probability that a knot is there; what one pass alone has otherwise does not count yet.
+fn there(marginal: &Marginal, saying: &Saying, passes: usize) -> f64 {
+    let (old, new) = saying.seen[..passes].split_at(marginal.since);
+    let tell = |passes: &[Option<bool>], there: bool| passes.iter().filter(|seen| **seen == Some(there)).count();
+    if marginal.went > marginal.came && tell(new, false) < LEAST_TELLING_NEW {
+        marginal.there + marginal.went
+    } else if marginal.came > marginal.went
+        && tell(new, true) < LEAST_TELLING_NEW
+        && tell(old, false) >= LEAST_TELLING_OLD
+    {
+        marginal.there - marginal.came
+    } else {
+        marginal.there
+    }
 }
 
 /// The change that is believed of a knot after so many passes.
@@ -339,7 +358,7 @@ mod tests {
     fn drives_that_miss_a_line_now_and_then_or_a_short_stretch_of_it_take_nothing_away() {
         assert_eq!(after(20, "+++-++++-+++++-++-++").change, None);
         assert_eq!(after(3, "++++++++++++++---").change, None);
-        assert!(after(20, "+++++++++--").probability > 0.05);
+        assert!(after(20, "+++++++++-").probability > 0.5);
     }
 
     #[test]
@@ -352,7 +371,7 @@ mod tests {
 
     #[test]
     fn what_folded_drives_left_goes_on() {
-        let there = Belief { probability: 0.98, stands: true, confirmed: None, change: None };
+        let there = Belief { probability: 0.98, stands: true, doubled: false, confirmed: None, change: None };
         let hearing = |pass| Hearing { pass, seen: false, chance: 0.9, ghost: 0.03 };
         let speakers: Vec<Speaker> = (0..3).map(|pass| (TimestampNs(100 + pass), DriveId(1))).collect();
         let beliefs = histories(&[Some(there); 20], &vec![(0..3).map(hearing).collect(); 20], &speakers);

@@ -116,6 +116,8 @@ pub(super) struct Line {
     posterior: Vec<f64>,
     /// What is known of it from drives that were folded.
     pub(super) record: LineRecord,
+    /// The line from which a stretch moved to here.
+    pub(super) moved_from: Option<usize>,
 }
 
 /// A knot of a line while it is made.
@@ -179,6 +181,7 @@ impl Line {
             category_votes: vec![0.0; categories],
             posterior: vec![1.0 / categories as f64; categories],
             record: LineRecord::default(),
+            moved_from: None,
         }
     }
 
@@ -328,6 +331,11 @@ impl Lines {
                 self.grid.entry(cell(point.x, point.y)).or_default().push((number as u32, knot as u32));
             }
         }
+    }
+
+    /// Whether a stretch of one of two lines moved to the other.
+    pub(super) fn are_old_and_new(&self, a: usize, b: usize) -> bool {
+        self.lines[a].moved_from == Some(b) || self.lines[b].moved_from == Some(a)
     }
 
     /// Calls `visit` with line, knot and place of every knot within about a radius of a place, horizontally.

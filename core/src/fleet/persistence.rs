@@ -88,11 +88,12 @@ impl Fusion<'_> {
         let mut speakers: Vec<Speaker> = Vec::new();
         let mut sights: Vec<Vec<Vec<Sight>>> =
             self.lines.lines.iter().map(|line| vec![Vec::new(); line.knots.len()]).collect();
+        let mut elsewhere: Vec<Vec<usize>> = self.lines.lines.iter().map(|line| vec![0; line.knots.len()]).collect();
         for (drive, number, pass) in self.passes() {
             let contribution = self.drives[drive].contribution;
             speakers.resize(number + 1, contribution.seniority());
             let views = views(pass, &contribution.sensor, &self.corrections[drive], &self.lines);
-            self.look(number, &views, &mut sights);
+            self.look(number, &views, &mut sights, &mut elsewhere);
         }
         let chances = learned_chances(&sights);
         let beliefs = sights.iter().enumerate().map(|(index, sights)| {
@@ -111,18 +112,30 @@ impl Fusion<'_> {
                 })
                 .collect();
             let before: Vec<Option<Belief>> = line.knots.iter().map(|knot| knot.record.belief).collect();
-            histories(&before, &hearings, &speakers)
+            let mut beliefs = histories(&before, &hearings, &speakers);
+            for (knot, (belief, elsewhere)) in beliefs.iter_mut().zip(&elsewhere[index]).enumerate() {
+                let seen = sights[knot].iter().filter(|sight| sight.seen).count();
+                if elsewhere + seen > 0 {
+                    belief.doubled = *elsewhere > seen;
+                }
+            }
+            beliefs
         });
         beliefs.collect()
     }
 
-    /// What one pass saw and missed.
-    fn look(&self, number: usize, views: &[Vec<View>], sights: &mut [Vec<Vec<Sight>>]) {
+    /// What one pass saw and missed, and what it has on another line.
+    fn look(&self, number: usize, views: &[Vec<View>], sights: &mut [Vec<Vec<Sight>>], elsewhere: &mut [Vec<usize>]) {
         let Ok(pass) = u32::try_from(number) else { return };
         for (index, (line, views)) in self.lines.lines.iter().zip(views).enumerate() {
             for (knot, (at, view)) in line.knots.iter().zip(views).enumerate() {
                 let seen = at.witnesses.iter().any(|witness| witness.pass == number);
-                if seen || (view.places >= LEAST_VIEWS && !self.sees_paint_beside(number, index, knot)) {
+                if !seen && view.places < LEAST_VIEWS {
+                    continue;
+                }
+                if !seen && self.sees_paint_beside(number, index, knot) {
+                    elsewhere[index][knot] += 1;
+                } else {
                     sights[index][knot].push(Sight { pass, seen, class: class_of(*view) });
                 }
             }
@@ -138,7 +151,7 @@ impl Fusion<'_> {
         self.lines.for_each_knot_near(&place, NO_ROOM_M, |other, at, there| {
             let across_m = (there - place).xy().dot(&normal).abs();
             let is_near = (there - place).xy().norm() < NO_ROOM_M && across_m > SAME_PAINT_M;
-            if !beside && is_near && other != line {
+            if !beside && is_near && other != line && !self.lines.are_old_and_new(line, other) {
                 beside = self.lines.lines[other].knots[at].drives() > own;
             }
         });
@@ -151,7 +164,7 @@ impl Fusion<'_> {
         let normal = normal_of(&self.lines.lines[line].tangent(knot));
         let mut beside = false;
         self.lines.for_each_knot_near(&place, 3.0, |other, at, _| {
-            if beside || other == line {
+            if beside || other == line || self.lines.are_old_and_new(line, other) {
                 return;
             }
             let own = self.lines.lines[other].knots[at].witnesses.iter().filter(|witness| witness.pass == number);

@@ -81,7 +81,7 @@ impl Fusion<'_> {
                 lateral_sigma_m: mean.across_information.max(1e-6).powf(-0.5),
                 height_sigma_m: mean.height_information.max(1e-6).powf(-0.5),
                 drives: line.knots[knot].drives(),
-                existence: beliefs[knot].probability,
+                existence: if beliefs[knot].doubled { 0.0 } else { beliefs[knot].probability },
                 confirmed: beliefs[knot].confirmed.unwrap_or_default(),
             }
         });

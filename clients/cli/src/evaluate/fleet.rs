@@ -8,7 +8,10 @@ mod report;
 mod simulated;
 mod true_change;
 
-use std::{collections::BTreeSet, path::PathBuf};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    path::PathBuf,
+};
 
 use clap::{Args, ValueEnum};
 use lanemap_core::{
@@ -199,6 +202,18 @@ fn noticed(road: &Road, drives: &[Contribution], map: &FusedMap, motion: &RigidM
         ..change.clone()
     });
     score_changes(&moved.collect::<Vec<_>>(), &happened)
+}
+
+/// Root mean square, over all roads, of the median absolute error by the number of drives, metres; of several worlds with drives
+/// whose receivers are off independently, it falls with the square root of that number.
+fn absolute_by_drives(figures: &[(&Road, Vec<ByDrives>)]) -> Vec<(usize, f64)> {
+    let mut squares: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
+    for figure in figures.iter().flat_map(|(_, figures)| figures).filter(|figure| !figure.scores.is_empty()) {
+        let (sum, count) = squares.entry(figure.drives).or_default();
+        *sum += figure.mean(|score| score.absolute.p50.powi(2));
+        *count += 1.0;
+    }
+    squares.into_iter().map(|(drives, (sum, count))| (drives, (sum / count).sqrt())).collect()
 }
 
 /// Share of the names in the map of one drive fewer that this map still has.

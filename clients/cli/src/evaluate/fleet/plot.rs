@@ -1,4 +1,5 @@
-//! Plots as SVG: each map beside its truth, and the errors by the number of drives.
+//! Plots as SVG: each map beside its truth, and the errors by the number of drives; of several worlds also the absolute error
+//! of them all, beside the fall with the square root of the number.
 
 use std::{fmt::Write as _, fs, path::Path};
 
@@ -9,7 +10,7 @@ use lanemap_core::{
 };
 use nalgebra::Point3;
 
-use super::{ByDrives, Road, polylines};
+use super::{ByDrives, Road, absolute_by_drives, polylines};
 
 /// Width of a plot, pixels.
 const WIDTH: f64 = 1600.0;
@@ -83,6 +84,26 @@ fn errors(figures: &[(&Road, Vec<ByDrives>)]) -> String {
             }
             text.push_str(r#""/>"#);
         }
+    }
+    let all = absolute_by_drives(figures);
+    if let Some((fewest, error_m)) = all.first().filter(|_| figures.len() > 1 && all.len() > 1) {
+        let falling = |share: f64| move |drives: usize| share * error_m * (*fewest as f64 / drives as f64).sqrt();
+        for (share, style) in [(1.0, "6 4"), (1.25, "2 6"), (0.75, "2 6")] {
+            let line = all.iter().map(|(drives, _)| (*drives, falling(share)(*drives)));
+            let _ = write!(text, r##"<polyline fill="none" stroke="#888" stroke-dasharray="{style}" points=""##);
+            for (drives, error_m) in line {
+                let _ = write!(text, "{:.1},{:.1} ", across(drives as f64), up(error_m));
+            }
+            text.push_str(r#""/>"#);
+        }
+        let _ = write!(text, r##"<polyline fill="none" stroke="#080" stroke-width="5" points=""##);
+        for (drives, error_m) in &all {
+            let _ = write!(text, "{:.1},{:.1} ", across(*drives as f64), up(*error_m));
+        }
+        text.push_str(r#""/>"#);
+        text.push_str(
+            r##"<text x="1000" y="54" fill="#080">broad: over all worlds; broken: 1/sqrt(drives), within 25 %</text>"##,
+        );
     }
     text + r##"<text x="1000" y="30" fill="#04c">relative p50</text><text x="1130" y="30" fill="#c40">relative p95</text><text x="1260" y="30" fill="#080">absolute p50</text></svg>"##
         + "\n"

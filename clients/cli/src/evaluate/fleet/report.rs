@@ -3,7 +3,7 @@
 use lanemap_core::evaluation::{ChangeScore, FleetScore, fleet_score::Quantiles};
 use serde_json::{Value, json};
 
-use super::{ByDrives, FleetArgs, Road, loop_closure::LoopClosure};
+use super::{ByDrives, FleetArgs, Road, absolute_by_drives, loop_closure::LoopClosure};
 use crate::evaluate::table::Table;
 
 /// Prints the figures.
@@ -49,7 +49,9 @@ fn as_json(figures: &[(&Road, Vec<ByDrives>)]) -> Value {
     let roads = figures.iter().map(
         |(road, figures)| json!({ "road": road.name, "by_drives": figures.iter().map(by_drives).collect::<Vec<_>>() }),
     );
-    json!({ "roads": roads.collect::<Vec<_>>() })
+    let absolute = absolute_by_drives(figures);
+    let absolute = absolute.iter().map(|(drives, error_m)| json!({ "n": drives, "absolute_rms_m": error_m }));
+    json!({ "roads": roads.collect::<Vec<_>>(), "all": absolute.collect::<Vec<_>>() })
 }
 
 fn changes_as_json(changes: ChangeScore) -> Value {
@@ -70,6 +72,25 @@ fn closure_as_json(closure: LoopClosure) -> Value {
         "height_m": { "p50": closure.height.p50, "p95": closure.height.p95 },
         "by_odometry_m": closure.by_odometry_m,
     })
+}
+
+/// The absolute error of all worlds by the number of drives, beside its fall with the square root; nothing of one world.
+fn absolute_as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
+    let all = absolute_by_drives(figures);
+    let Some((fewest, first_m)) = all.first().filter(|_| figures.len() > 1 && all.len() > 1) else {
+        return String::new();
+    };
+    let mut table = Table::new(&["drives", "absolute, rms", "1/sqrt(drives)", "ratio"]);
+    for (drives, error_m) in &all {
+        let falling_m = first_m * (*fewest as f64 / *drives as f64).sqrt();
+        table.row(vec![
+            drives.to_string(),
+            format!("{error_m:.3}"),
+            format!("{falling_m:.3}"),
+            format!("{:.2}", error_m / falling_m),
+        ]);
+    }
+    format!("\nMedian absolute error over all worlds, metres.\n\n{}", table.render())
 }
 
 /// How well drives that came back over their own road lie on themselves; nothing where none did.
@@ -160,8 +181,9 @@ fn as_text(figures: &[(&Road, Vec<ByDrives>)]) -> String {
         }
     }
     format!(
-        "Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}{}{}",
+        "Errors in metres; lateral and height after one rigid motion of the whole map.\n\n{}{}{}{}",
         table.render(),
+        absolute_as_text(figures),
         closures_as_text(figures),
         changes_as_text(figures)
     )

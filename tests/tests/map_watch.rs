@@ -80,7 +80,8 @@ async fn a_copy_of_the_map_is_the_map_though_the_connection_is_cut_again_and_aga
     }
     growing.await.unwrap();
     catch_up(&mut watch, &server).await;
-    assert!(breaks >= 3 && versions >= 4, "{breaks} breaks, {versions} versions");
+    // Versions that came while it was away are told as one.
+    assert!(breaks >= 3 && versions >= 2, "{breaks} breaks, {versions} versions");
     server.shutdown().await;
 }
 

@@ -2,8 +2,9 @@
 
 mod roads;
 
-use lanemap_core::fleet::{
-    Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto,
+use lanemap_core::{
+    Category,
+    fleet::{Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto},
 };
 use proptest::prelude::*;
 use roads::{Road, Survey, anchor};
@@ -245,7 +246,7 @@ fn a_dashed_line_that_goes_on_solid_stays_two() {
     let road = Road::bend(200.0);
     let mut drives = Survey::of(&road, 42).drives(3);
     drives[0] = interrupted(drives[0].clone(), 2, 30..31);
-    let solid = lanemap_core::Category::WhiteSolid;
+    let solid = Category::WhiteSolid;
     let last = drives[0].lanes.len() - 1;
     let onward = &mut drives[0].lanes[last];
     onward.category = solid;
@@ -253,4 +254,31 @@ fn a_dashed_line_that_goes_on_solid_stays_two() {
     onward.category_posterior[solid.index()] = 0.98;
     assert_eq!(fused(&drives[..1]).lanes.len(), road.lines.len() + 1);
     assert_eq!(fused(&drives[..2]).lanes.len(), road.lines.len() + 1);
+}
+
+#[test]
+fn a_drive_whose_receiver_is_two_lanes_off_is_laid_on_its_own_lanes() {
+    // Lines a lane apart all over the road: only its edges tell which is which.
+    let dashed = |left_m: f64| (left_m, Category::WhiteDashed);
+    let lines = vec![
+        (10.5, Category::LeftCurb),
+        dashed(7.0),
+        dashed(3.5),
+        (0.0, Category::DoubleYellowSolid),
+        dashed(-3.5),
+        dashed(-7.0),
+        (-10.5, Category::RightCurb),
+    ];
+    let road = Road { lines, radius_m: 5_000.0, ..Road::bend(400.0) };
+    let drives = |bias_sigma_m: f64| Survey { bias_sigma_m, ..Survey::of(&road, 44) }.drives(4);
+    let mut together = drives(0.3);
+    let shift = |fix: &mut lanemap_core::GnssFix, north_m: f64| fix.latitude_deg += north_m / 111_195.0;
+    // The receiver says 1.5 m and is off by 6.4 m: four standard deviations of what it and three others are off by.
+    for fix in together[3].trajectory.iter_mut().filter_map(|point| point.fix.as_mut()) {
+        shift(fix, 6.4);
+    }
+    let map = fused(&together);
+    assert_eq!(map.lanes.len(), road.lines.len(), "none is drawn beside the road");
+    let seen_by_all = map.lanes.iter().filter(|lane| lane.drives == 4).count();
+    assert_eq!(seen_by_all, road.lines.len());
 }

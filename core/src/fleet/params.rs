@@ -94,7 +94,7 @@ impl Default for FleetParams {
             most_lateral_sigma_m: 0.4,
             bridged_knots: 2,
             shortest_lane_m: 8.0,
-            search_sigmas: 3.0,
+            search_sigmas: 4.0,
         }
     }
 }

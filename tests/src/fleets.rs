@@ -189,3 +189,13 @@ pub async fn cell_maps(url: &str) -> Vec<v1::CellMap> {
     let cells = cell_bytes(url).await;
     cells.values().map(|bytes| v1::CellMap::decode(bytes.as_slice()).unwrap()).collect()
 }
+
+/// Has a map grow in many versions.
+pub async fn grow(url: &str, drives: &[WireDrive]) {
+    for drive in drives {
+        for frames in (40..drive.frames.len()).step_by(40) {
+            drive.upload(url, frames, false).await;
+        }
+        drive.upload_whole(url).await;
+    }
+}

@@ -21,6 +21,13 @@ pub async fn start(folder: &Path) -> RunningServer {
     Server::start(config(folder)).await.unwrap()
 }
 
+/// A server in this process whose map changes often.
+pub async fn lively(folder: &Path, change: impl FnOnce(&mut ServerConfig)) -> RunningServer {
+    let mut config = ServerConfig { fuse_interval_ms: 20, ..config(folder) };
+    change(&mut config);
+    Server::start(config).await.unwrap()
+}
+
 /// The bytes of a session's map, as `MapService` gives it.
 pub async fn map_bytes(url: &str, session: &str) -> Vec<u8> {
     let mut client = MapServiceClient::connect(url.to_owned()).await.unwrap();

@@ -2,26 +2,19 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
 
-use std::{collections::BTreeMap, net::SocketAddr, path::Path, time::Duration};
+use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
 
 use lanemap_client::{Area, MapCopy, MapNews, MapWatch, Reconnect, WatchOptions};
 use lanemap_proto::v1::{self, MapEventKind};
-use lanemap_server::{RunningServer, Server, ServerConfig};
+use lanemap_server::RunningServer;
 use lanemap_simulator::fleet::ChangePlan;
 use lanemap_tests::{
-    fleets::{PATIENCE, WireDrive, along_a_changing_road, along_a_road, cell_bytes, settled},
+    fleets::{PATIENCE, along_a_changing_road, along_a_road, cell_bytes, grow, settled},
     proxy::{Fault, Proxy},
     servers,
 };
 use prost::Message;
 use tokio::time::timeout;
-
-/// A server whose map changes often.
-async fn lively(folder: &Path, change: impl FnOnce(&mut ServerConfig)) -> RunningServer {
-    let mut config = ServerConfig { fuse_interval_ms: 20, ..servers::config(folder) };
-    change(&mut config);
-    Server::start(config).await.unwrap()
-}
 
 /// Tries again soon.
 fn quick(area: Area) -> WatchOptions {
@@ -31,15 +24,6 @@ fn quick(area: Area) -> WatchOptions {
 
 fn bytes_of(copy: &MapCopy) -> BTreeMap<String, Vec<u8>> {
     copy.cells().iter().map(|(cell, map)| (cell.clone(), map.encode_to_vec())).collect()
-}
-
-async fn grow(url: &str, drives: &[WireDrive]) {
-    for drive in drives {
-        for frames in (40..drive.frames.len()).step_by(40) {
-            drive.upload(url, frames, false).await;
-        }
-        drive.upload_whole(url).await;
-    }
 }
 
 /// Has it follow until it has all.
@@ -54,7 +38,7 @@ async fn a_copy_of_the_map_is_the_map_though_the_connection_is_cut_again_and_aga
     let drives = along_a_road(41, 3, 200.0, true);
     let folder = tempfile::tempdir().unwrap();
     // No change comes with its lines: each is fetched, and what is asked for wears the connection out.
-    let server = lively(folder.path(), |config| config.max_change_event_bytes = 0).await;
+    let server = servers::lively(folder.path(), |config| config.max_change_event_bytes = 0).await;
     let url = server.url();
     let address: SocketAddr = url.strip_prefix("http://").unwrap().parse().unwrap();
     let proxy = Proxy::start(address, 350, &[Fault::Cut; 8]).await;
@@ -89,7 +73,7 @@ async fn a_copy_of_the_map_is_the_map_though_the_connection_is_cut_again_and_aga
 async fn a_copy_goes_on_after_a_restart_of_the_server_and_in_another_process_with_a_part_of_the_map_too() {
     let drives = along_a_road(42, 3, 200.0, true);
     let folder = tempfile::tempdir().unwrap();
-    let server = lively(folder.path(), |_| ()).await;
+    let server = servers::lively(folder.path(), |_| ()).await;
     let url = server.url();
     let mut watch = MapWatch::new(&url, quick(Area::All)).await.unwrap();
     drives[0].upload_whole(&url).await;
@@ -97,7 +81,7 @@ async fn a_copy_goes_on_after_a_restart_of_the_server_and_in_another_process_wit
     let address: SocketAddr = url.strip_prefix("http://").unwrap().parse().unwrap();
     server.shutdown().await;
 
-    let server = lively(folder.path(), |config| config.listen = address).await;
+    let server = servers::lively(folder.path(), |config| config.listen = address).await;
     drives[1].upload_whole(&url).await;
     catch_up(&mut watch, &server).await;
 
@@ -121,7 +105,7 @@ async fn a_copy_goes_on_after_a_restart_of_the_server_and_in_another_process_wit
 async fn a_copy_that_was_away_for_too_long_begins_anew_and_is_the_map_again() {
     let drives = along_a_road(43, 2, 120.0, false);
     let folder = tempfile::tempdir().unwrap();
-    let server = lively(folder.path(), |config| config.cell_versions_kept_s = 0).await;
+    let server = servers::lively(folder.path(), |config| config.cell_versions_kept_s = 0).await;
     let url = server.url();
     let mut watch = MapWatch::new(&url, quick(Area::All)).await.unwrap();
     drives[0].upload(&url, 60, false).await;
@@ -141,7 +125,7 @@ async fn what_happens_to_the_road_is_told_before_the_cell_in_which_it_did() {
     let plan = ChangePlan { vanished: 1, first_drive: 4, last_drive: 4, max_length_m: 100.0, ..ChangePlan::none() };
     let road = along_a_changing_road(44, 10, plan);
     let folder = tempfile::tempdir().unwrap();
-    let server = lively(folder.path(), |_| ()).await;
+    let server = servers::lively(folder.path(), |_| ()).await;
     let url = server.url();
     let mut watch = MapWatch::new(&url, quick(Area::All)).await.unwrap();
     for drive in &road.drives {

@@ -6,12 +6,14 @@
 //! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
 //! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
 //!    shifts, which must be unique to be believed.
-//! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one.
+//! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
+//!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
 //! 5. [`base`]: the oldest drives are folded, so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
 //!    (`persistence`, `moved`), and the most likely history of each stretch (`history`).
-//! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness.
+//! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness; where
+//!    witnesses come and go, the line runs on as they say its shape is (`continuity`).
 //!
 //! ```
 //! use lanemap_core::{fleet::*, geometry::georeference::{Anchor, Georeference, Wgs84}, *};

@@ -1,7 +1,8 @@
 //! Growth: what one pass of a drive adds to the lines.
 //!
 //! Where its lanes lie on lines, it is a witness at their knots. What of a lane lies on no line extends the line that it
-//! leaves at its end, and begins a line elsewhere: at the start of a drive, and where roads fork.
+//! leaves at its end, and begins a line elsewhere: at the start of a drive, and where roads fork. A lane that leaves one line
+//! at its end and comes onto another at its start joins the two.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

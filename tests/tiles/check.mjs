@@ -49,7 +49,9 @@ for (let zoom = tileJson.minzoom; zoom <= tileJson.maxzoom; zoom += 1) {
     const bytes = new Uint8Array(await answer.arrayBuffer());
     const tile = new VectorTile(new PbfReader(bytes));
     const wanted = [...described.values()].filter((layer) => layer.minzoom <= zoom).map((layer) => layer.id);
-    assert.deepEqual(Object.keys(tile.layers).sort(), wanted.sort(), address);
+    // Not in every tile a line is dashed.
+    const some = wanted.filter((id) => id !== "dashes" || tile.layers.dashes);
+    assert.deepEqual(Object.keys(tile.layers).sort(), some.sort(), address);
     lines[`${zoom}/${name}`] = {};
     for (const [id, layer] of Object.entries(tile.layers)) {
       assert.ok(layer.length > 0 && layer.extent === 4096 && layer.version === 2, `${address} ${id}`);
@@ -69,4 +71,5 @@ for (let zoom = tileJson.minzoom; zoom <= tileJson.maxzoom; zoom += 1) {
   }
 }
 await writeFile(`${folder}/lines.json`, JSON.stringify(lines));
+assert.ok(Object.values(lines).some(({ dashes }) => dashes), "some line is dashed");
 console.log(`${Object.keys(lines).length} tiles decode with @mapbox/vector-tile; the style is valid`);

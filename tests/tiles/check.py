@@ -61,8 +61,9 @@ def main(url, folder):
             continue
         unit_m = 40_075_016.7 * math.cos(math.atan(math.sinh(math.pi * (1 - 2 * (y + 0.5) / 2**zoom)))) / 2**zoom / EXTENT
         limit = 0.51 + GEOJSON_M / unit_m
-        for feature, parts in zip(tile["lanes"]["features"], layers["lanes"]):
-            properties = feature["properties"]
+        named = [(feature["properties"], parts) for layer in ("lanes", "dashes") if layer in layers
+                 for feature, parts in zip(tile[layer]["features"], layers[layer])]
+        for properties, parts in named:
             line = [units(place, zoom) for place in lines[f"{properties['cell']}.{properties['lane']}.{properties['part']}"]]
             for part in parts:
                 for index, vertex in enumerate(part):

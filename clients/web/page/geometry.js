@@ -41,6 +41,30 @@ export function lengthOf({ type, coordinates }) {
   return lengths.reduce((sum, length) => sum + length, 0);
 }
 
+/** The dashes of a GeoJSON geometry of lines: `dashM` metres of every `dashM + gapM`, after half a gap. */
+export function dashesOf({ type, coordinates }, dashM, gapM) {
+  const dashes = [];
+  for (const line of type === "MultiLineString" ? coordinates : [coordinates]) {
+    // How far it is to where paint begins or ends.
+    let [dash, leftM] = [undefined, gapM / 2];
+    for (let index = 1; index < line.length; index += 1) {
+      const [from, to] = [line[index - 1], line[index]];
+      const lengthM = distance(from, to);
+      let wayM = 0;
+      while (lengthM - wayM > leftM) {
+        wayM += leftM;
+        const place = [0, 1].map((axis) => from[axis] + ((to[axis] - from[axis]) * wayM) / lengthM);
+        if (dash) dashes.push([...dash, place]);
+        [dash, leftM] = dash ? [undefined, gapM] : [[place], dashM];
+      }
+      leftM -= lengthM - wayM;
+      dash?.push(to);
+    }
+    if (dash?.length > 1) dashes.push(dash);
+  }
+  return { type: "MultiLineString", coordinates: dashes };
+}
+
 /** The smallest box `[west, south, east, north]` around the coordinates of GeoJSON geometries, or `undefined`. */
 export function boxOf(geometries) {
   const box = [Infinity, Infinity, -Infinity, -Infinity];

@@ -2,7 +2,7 @@
 
 import { gridLayers } from "./grid.js";
 import { measure, measureLayer } from "./measures.js";
-import { groundWidth, paintLayers, roadLayers } from "./paint.js";
+import { DASHES_FROM, groundWidth, paintLayers, roadLayers } from "./paint.js";
 
 /** First zoom of vector tiles: farther out, the cells of the map are drawn as squares. */
 export const TILES_FROM = 12;
@@ -10,6 +10,7 @@ export const TILES_FROM = 12;
 const STRETCHES_FROM = 15;
 
 const SHARED = { source: "lanes", sourceLayer: "lanes" };
+const DASHED = { source: "lanes", "source-layer": "dashes", minzoom: DASHES_FROM };
 const NONE = ["==", ["literal", 1], 0];
 
 /**
@@ -30,10 +31,10 @@ export function layersOf(view, colours) {
     ...roadLayers(road),
     ...(alone ? roadLayers({ prefix: "drive-", source: "drive", latitude, colours: { ...colours, ribbon: colours.accent } }) : []),
     chosenLayer(view, colours),
-    ...(by && !alone ? measureLayers(by, view, shared) : paintLayers({ ...road, strength: muted ? 0.25 : 1 })),
+    ...(by && !alone ? measureLayers(by, view, shared) : paintLayers({ ...road, dashed: DASHED, strength: muted ? 0.25 : 1 })),
     ...(view.layer === "change" && !alone ? [...changeLayers(colours, latitude), ...eventLayers(colours, view)] : []),
     ...(alone ? [
-      ...paintLayers({ prefix: "drive-", source: "drive", latitude, colours }),
+      ...paintLayers({ prefix: "drive-", source: "drive", dashed: { source: "drive-dashes" }, latitude, colours }),
       traceLayer(colours),
     ] : []),
     truthLayer(colours, latitude),
@@ -57,7 +58,7 @@ function measureLayers(by, view, shown) {
 
 function cellLayers(colours, shown) {
   const cells = { source: "cells", maxzoom: TILES_FROM + 0.5, ...(shown ? { filter: shown } : {}) };
-  const fading = ["interpolate", ["linear"], ["zoom"], TILES_FROM - 0.5, 1, TILES_FROM + 0.5, 0];
+  const fading = ["interpolate", ["linear"], ["zoom"], TILES_FROM - 0.7, 0.8, TILES_FROM, 0.12, TILES_FROM + 0.5, 0];
   return [
     { id: "cells", type: "fill", ...cells, paint: { "fill-color": colours.ribbon, "fill-opacity": fading } },
     { id: "cells-edge", type: "line", ...cells, paint: { "line-color": colours.ground, "line-width": 1, "line-opacity": fading } },

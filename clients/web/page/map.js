@@ -4,6 +4,7 @@ import * as maplibre from "./maplibre-gl.mjs";
 import { joinBoxes } from "./geometry.js";
 import { Grid } from "./grid.js";
 import { TILES_FROM, isClickable, layersOf } from "./layers.js";
+import { dashesOfLines } from "./paint.js";
 import { colours, moving, onTheme } from "./theme.js";
 import { vehicleIcons } from "./vehicles.js";
 
@@ -46,7 +47,7 @@ export class LaneMap {
             type: "vector", tiles: [`${server.address("tiles/lanes/")}{z}/{x}/{y}`],
             minzoom: TILES_FROM, maxzoom: TILES_TO,
           },
-          cells: EXACT, drive: EXACT, trace: EXACT, changes: EXACT, events: EXACT, truth: EXACT, ruler: EXACT, vehicles: EXACT, grid: EXACT,
+          cells: EXACT, drive: EXACT, "drive-dashes": EXACT, trace: EXACT, changes: EXACT, events: EXACT, truth: EXACT, ruler: EXACT, vehicles: EXACT, grid: EXACT,
         },
         layers: this.#layers,
       },
@@ -90,6 +91,7 @@ export class LaneMap {
   /** Puts features into a source: "cells", "drive", "trace", "changes", "events", "truth", "ruler" or "vehicles". */
   put(source, features) {
     this.map.getSource(source).setData({ type: "FeatureCollection", features });
+    if (source === "drive") this.put("drive-dashes", dashesOfLines(features));
   }
 
   /** Shows the map as it was at a revision, or as it is now. */
@@ -114,7 +116,12 @@ export class LaneMap {
   /** Flies to a box; without one it stays, and says so. */
   look(box, durationMs, maxZoom = 19) {
     if (!box) return false;
-    this.map.fitBounds(box, { padding: this.padding(), maxZoom, duration: moving(durationMs) });
+    const camera = this.map.cameraForBounds(box, { padding: this.padding(), maxZoom });
+    // Where little of it would be out of sight, roads are shown rather than squares.
+    if (camera.zoom > TILES_FROM - 0.7) camera.zoom = Math.max(camera.zoom, TILES_FROM);
+    const [here, there] = [this.map.project(this.map.getCenter()), this.map.project(camera.center)];
+    const isThere = Math.abs(camera.zoom - this.map.getZoom()) < 0.02 && Math.hypot(here.x - there.x, here.y - there.y) < 2;
+    if (!isThere) this.map.flyTo({ ...camera, duration: moving(durationMs) });
     return true;
   }
 
@@ -154,7 +161,7 @@ export class LaneMap {
     for (;;) {
       this.map.triggerRepaint();
       await this.map.once("render");
-      const loaded = ["lanes", "drive", "trace"].every((source) => this.map.isSourceLoaded(source));
+      const loaded = ["lanes", "drive", "drive-dashes", "trace"].every((source) => this.map.isSourceLoaded(source));
       if (loaded && !this.map.isMoving()) return;
     }
   }

@@ -3,7 +3,7 @@
 // Breadths and dashes are metres on the ground: 0.15 m of paint, dashes of 3 m with gaps of 6 m. Farther out than a breadth
 // can be seen it is kept at a least number of pixels; dashes stay true for as long as they can be told apart.
 
-import { metresPerPixel } from "./geometry.js";
+import { dashesOf, metresPerPixel } from "./geometry.js";
 
 /** The legend, in its order: what a kind of line is called and how it is painted. */
 export const LEGEND = [
@@ -35,14 +35,22 @@ const PAINT = [0.15, 1.5];
 const DASH_M = [3, 6];
 /** The same of a line whose category is not known: nothing is claimed of its paint. */
 const UNKNOWN_DASH_M = [0.6, 0.9];
+/** First zoom at which tiles have dashes. */
+export const DASHES_FROM = 15;
 /** Farther out than the first a road is a plain ribbon; nearer than the second its paint is seen in full. */
 const [RIBBON_ZOOM, PAINT_ZOOM] = [14.5, 16.2];
 
+/** What is painted of the dashed ones of some features of lines. */
+export function dashesOfLines(features) {
+  const dashed = features.filter(({ properties }) => /dashed/.test(properties.category));
+  return dashed.map((feature) => ({ ...feature, geometry: dashesOf(feature.geometry, ...DASH_M) }));
+}
+
 /**
  * The layers that draw lines by their paint, bottom first: those of `source` (a source's id, and its layer) that `shown` (a
- * filter, or nothing) lets through, at `latitude`.
+ * filter, or nothing) lets through, at `latitude`. `dashed` is the source that has dashes cut, and the zoom from which on.
  */
-export function paintLayers({ prefix = "", source, sourceLayer, shown, latitude, colours, strength = 1 }) {
+export function paintLayers({ prefix = "", source, sourceLayer, dashed, shown, latitude, colours, strength = 1 }) {
   const among = (categories) => ["in", CATEGORY, ["literal", categories]];
   const colour = [
     "case",
@@ -64,18 +72,23 @@ export function paintLayers({ prefix = "", source, sourceLayer, shown, latitude,
     layout: { "line-join": "round" },
     paint: { "line-color": colour, "line-opacity": visible, "line-width": breadth(PAINT), ...paint },
   });
-  const dash = { "line-dasharray": dashes(DASH_M, PAINT, latitude) };
+  // A pattern begins anew in every tile: near the road, dashes come cut from the line.
+  const far = { "line-dasharray": dashes(DASH_M, PAINT, latitude) };
+  const strokes = (id, filter, paint) => [
+    ...(dashed.minzoom > RIBBON_ZOOM ? [{ ...line(`${id}-far`, filter, { ...far, ...paint }), maxzoom: dashed.minzoom }] : []),
+    { ...line(id, filter, paint), ...dashed },
+  ];
   const apart = { "line-gap-width": breadth(PAINT, 0.8) };
   const beside = (categoriesToTheLeft) => groundOffset(PAINT, latitude, ["case", among(categoriesToTheLeft), -0.9, 0.9]);
   return [
     line("curb", among(CURB), { "line-width": breadth([0.3, 2]) }),
     line("unknown", ["==", CATEGORY, "unknown"], { "line-dasharray": dashes(UNKNOWN_DASH_M, PAINT, latitude) }),
     line("solid", among(SINGLE.solid), {}),
-    line("dashed", among(SINGLE.dashed), dash),
+    ...strokes("dashed", among(SINGLE.dashed), {}),
     line("double-solid", among(DOUBLE.solid), apart),
-    line("double-dashed", among(DOUBLE.dashed), { ...dash, ...apart }),
+    ...strokes("double-dashed", among(DOUBLE.dashed), apart),
     line("mixed-solid", among(MIXED), { "line-offset": beside(LEFT_SOLID) }),
-    line("mixed-dashed", among(MIXED), { ...dash, "line-offset": beside(RIGHT_SOLID) }),
+    ...strokes("mixed-dashed", among(MIXED), { "line-offset": beside(RIGHT_SOLID) }),
   ];
 }
 

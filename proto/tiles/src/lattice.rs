@@ -67,24 +67,25 @@ impl PlaneCurve<'_> {
     /// Appends the vertices between two control points, both included, to those of the stretch before, whose last is the
     /// first of this one and is not repeated.
     pub fn append_vertices(&self, from: usize, to: usize, zoom: u8, vertices: &mut Vec<Vertex>) {
-        let mut append = |vertex: Vertex| {
-            if vertices.last() != Some(&vertex) {
-                vertices.push(vertex);
-            }
-        };
+        let places = self.places(from as f64, to as f64, units(zoom));
+        let ends = [self.breakpoint(from, &places[0]), self.breakpoint(to, &places[places.len() - 1])];
+        through(&places, ends, vertices);
+    }
+
+    /// Appends the vertices of the part between two parameters: 3.5 is half way from control point 3 to the next.
+    pub fn append_part(&self, [from, to]: [f64; 2], zoom: u8, vertices: &mut Vec<Vertex>) {
         let places = self.places(from, to, units(zoom));
-        let mut start = 0;
-        append(self.breakpoint(from, &places[0]));
-        for end in 1..places.len() {
-            if places[end].wanted {
-                let last =
-                    if end + 1 == places.len() { self.breakpoint(to, &places[end]) } else { snapped(&places[end]) };
-                let first = if start == 0 { self.breakpoint(from, &places[0]) } else { snapped(&places[start]) };
-                between(&places[start..=end], first, last, &mut append);
-                append(last);
-                start = end;
-            }
-        }
+        let ends = [snapped(&places[0]), snapped(&places[places.len() - 1])];
+        through(&places, ends, vertices);
+    }
+
+    /// The point at a parameter, on the plane.
+    #[must_use]
+    pub fn at(&self, parameter: f64) -> Point2<f64> {
+        let index = self.segment_of(parameter);
+        let [p0, p1, p2, p3] = self.segment(index, 1.0);
+        let u = parameter - index as f64;
+        Point2::from(p0 + (p1 + (p2 + p3 * u) * u) * u)
     }
 
     /// The vertex at a control point: the same for the stretches on both sides of it.
@@ -93,31 +94,42 @@ impl PlaneCurve<'_> {
         if on_border { rounded(place.at) } else { snapped(place) }
     }
 
-    /// The ends of chords between two control points, and the places between them where a vertex is wanted.
-    fn places(&self, from: usize, to: usize, units: f64) -> Vec<Place> {
-        let mut places = Vec::with_capacity(2 * (to - from) + 2);
-        let mut segment = self.segment(from.min(to - 1), units);
-        places.push(Place { at: segment[0].into(), along: segment[1], wanted: true });
-        for index in from..to {
-            if index > from {
-                segment = self.segment(index, units);
+    /// The ends of chords between two parameters, and the places between them where a vertex is wanted.
+    fn places(&self, from: f64, to: f64, units: f64) -> Vec<Place> {
+        let first = self.segment_of(from);
+        let mut places = Vec::with_capacity(2 * (self.segment_of(to) - first) + 4);
+        let mut index = first;
+        while index == first || (index as f64) < to {
+            let [p0, p1, p2, p3] = self.segment(index, units);
+            let place = |u: f64, wanted: bool| Place {
+                at: Point2::from(p0 + (p1 + (p2 + p3 * u) * u) * u),
+                along: p1 + (2.0 * p2 + 3.0 * p3 * u) * u,
+                wanted,
+            };
+            let [start, end] = [(from - index as f64).max(0.0), (to - index as f64).min(1.0)];
+            if index == first {
+                places.push(place(start, true));
             }
-            let [p0, p1, p2, p3] = segment;
             let bend = (2.0 * p2).norm().max((2.0 * p2 + 6.0 * p3).norm());
-            let chords = (bend / (8.0 * FLAT_UNITS)).sqrt().ceil().clamp(1.0, MOST_CHORDS);
+            let chords = ((bend / (8.0 * FLAT_UNITS)).sqrt() * (end - start)).ceil().clamp(1.0, MOST_CHORDS);
+            let is_last = (index + 1) as f64 >= to;
             let mut chord = 1.0;
             while chord <= chords {
-                let u = chord / chords;
-                let at = Point2::from(p0 + (p1 + (p2 + p3 * u) * u) * u);
-                let along = p1 + (2.0 * p2 + 3.0 * p3 * u) * u;
-                let is_last = index + 1 == to && chord >= chords;
+                let next = place(start + (end - start) * (chord / chords), is_last && chord >= chords);
                 let before = places[places.len() - 1].at;
-                push_edges(&before, &at, &mut places);
-                places.push(Place { at, along, wanted: is_last });
+                push_edges(&before, &next.at, &mut places);
+                places.push(next);
                 chord += 1.0;
             }
+            index += 1;
         }
         places
+    }
+
+    /// The segment in which a parameter lies.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a parameter counts control points")]
+    fn segment_of(&self, parameter: f64) -> usize {
+        (parameter.max(0.0) as usize).min(self.points.len() - 2)
     }
 
     /// Coefficients of a segment by powers of its parameter, units.
@@ -154,6 +166,26 @@ fn push_edges(from: &Point2<f64>, to: &Point2<f64>, places: &mut Vec<Place>) {
     }
     if places.len() > first + 1 {
         places[first..].sort_by(|a, b| (a.at - from).dot(&along).total_cmp(&(b.at - from).dot(&along)));
+    }
+}
+
+/// Appends the vertices of a line through some places, but for a first one that is the last there is; it begins and ends
+/// with those given.
+fn through(places: &[Place], ends: [Vertex; 2], vertices: &mut Vec<Vertex>) {
+    let mut append = |vertex: Vertex| {
+        if vertices.last() != Some(&vertex) {
+            vertices.push(vertex);
+        }
+    };
+    append(ends[0]);
+    let (mut start, mut first) = (0, ends[0]);
+    for end in 1..places.len() {
+        if places[end].wanted {
+            let last = if end + 1 == places.len() { ends[1] } else { snapped(&places[end]) };
+            between(&places[start..=end], first, last, &mut append);
+            append(last);
+            (start, first) = (end, last);
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use nalgebra::{Point2, Vector2};
 
 use crate::{
-    BUFFER, EXTENT, STRETCHES_FROM, TileId, VECTOR_ZOOMS, WHOLE_FROM,
+    BUFFER, DASHES_FROM, EXTENT, STRETCHES_FROM, TileId, VECTOR_ZOOMS, WHOLE_FROM,
     lattice::{Vertex, units},
     mvt::{LayerBuilder, Property, Tile},
     projected::{PlaneBox, ProjectedCell, ProjectedLine, SPAN, feature_id},
@@ -50,7 +50,7 @@ const fn field(name: &'static str, kind: FieldType, from_zoom: u8) -> Field {
 const FIRST: u8 = *VECTOR_ZOOMS.start();
 
 /// The layers, in the order in which a tile has them.
-pub const LAYERS: [Layer; 2] = [
+pub const LAYERS: [Layer; 3] = [
     Layer {
         name: "lanes",
         description: "The lines of the shared map, each with what is known of it as a whole",
@@ -87,6 +87,19 @@ pub const LAYERS: [Layer; 2] = [
             field("confirmed_s", FieldType::Number, STRETCHES_FROM),
         ],
     },
+    Layer {
+        name: "dashes",
+        description: "What is painted of the lines that are dashed",
+        from_zoom: DASHES_FROM,
+        fields: &[
+            field("category", FieldType::Text, DASHES_FROM),
+            field("category_code", FieldType::Number, DASHES_FROM),
+            field("existence", FieldType::Number, DASHES_FROM),
+            field("cell", FieldType::Text, DASHES_FROM),
+            field("lane", FieldType::Text, DASHES_FROM),
+            field("part", FieldType::Number, DASHES_FROM),
+        ],
+    },
 ];
 
 fn lane_properties<'a>(cell: &'a ProjectedCell, line: &'a ProjectedLine) -> [Property<'a>; 13] {
@@ -121,6 +134,18 @@ fn stretch_properties<'a>(line: &'a ProjectedLine, stretch: &Stretch) -> [Proper
     ]
 }
 
+fn dash_properties<'a>(cell: &'a ProjectedCell, line: &'a ProjectedLine) -> [Property<'a>; 6] {
+    let known = &line.known;
+    [
+        Property::Text(&known.category),
+        Property::Whole(known.category_code.into()),
+        Property::Number(known.existence),
+        Property::Text(cell.name()),
+        Property::Text(&known.lane),
+        Property::Whole(known.part.into()),
+    ]
+}
+
 /// The bytes of a vector tile, of the cells that it [touches](TileId::cells_touched), in their order; none where nothing is
 /// in it, or its zoom is not among [`VECTOR_ZOOMS`].
 #[must_use]
@@ -133,6 +158,7 @@ pub fn vector_tile<'a>(tile: TileId, cells: impl IntoIterator<Item = &'a Project
     };
     let mut lanes = LayerBuilder::new(LAYERS[0].name, names(&LAYERS[0]));
     let mut stretches = LayerBuilder::new(LAYERS[1].name, names(&LAYERS[1]));
+    let mut dashes = LayerBuilder::new(LAYERS[2].name, names(&LAYERS[2]));
     let lane_fields = names(&LAYERS[0]).len();
     for cell in cells {
         let window = Window::of(tile, cell);
@@ -158,9 +184,13 @@ pub fn vector_tile<'a>(tile: TileId, cells: impl IntoIterator<Item = &'a Project
                 drawing.draw_stretches(&spans, &mut stretches);
             }
             lanes.add_line(line.known.id, &drawing.parts, &lane_properties(cell, line));
+            if tile.z() >= DASHES_FROM && !line.dashes.is_empty() {
+                drawing.draw_dashes(&spans);
+                dashes.add_line(line.known.id, &drawing.parts, &dash_properties(cell, line));
+            }
         }
     }
-    let layers: Vec<_> = [lanes.finish(), stretches.finish()].into_iter().flatten().collect();
+    let layers: Vec<_> = [lanes.finish(), stretches.finish(), dashes.finish()].into_iter().flatten().collect();
     prost::Message::encode_to_vec(&Tile { layers })
 }
 
@@ -251,6 +281,20 @@ impl<'a> Drawing<'_, 'a> {
         for (stretch, parts) in drawn {
             let id = feature_id(&format!("{}.{}", self.line.known.id, stretch.from));
             layer.add_line(id, &parts, &stretch_properties(self.line, stretch));
+        }
+    }
+
+    /// Draws the dashes that may enter the window, each whole, in place of what was drawn before.
+    fn draw_dashes(&mut self, spans: &[[usize; 2]]) {
+        self.parts.clear();
+        let dashes = &self.line.dashes;
+        for [from, to] in spans.iter().map(|span| span.map(|index| index as f64)) {
+            let first = dashes.partition_point(|dash| dash[1] <= from);
+            for dash in dashes[first..].iter().take_while(|dash| dash[0] < to) {
+                self.vertices.clear();
+                self.line.curve().append_part(*dash, self.window.zoom, &mut self.vertices);
+                self.window.cut(&self.vertices, &mut self.parts);
+            }
         }
     }
 

@@ -53,7 +53,16 @@
 //! | `lateral_sigma_m` | number | standard deviation across the line, mean over this stretch |
 //! | `height_sigma_m` | number | standard deviation of the height, mean over this stretch |
 //! | `confirmed_s` | integer | start of the last drive that saw its stalest control point, seconds since the Unix epoch |
+//!
+//! Layer `dashes`, zoom 15 and above: the same lines, where they are dashed: what is painted of them, 3 m of every 9 m, cut so
+//! that dashes run on through the borders of tiles ([`dashes`]). Its feature ids are those of `lanes`.
+//!
+//! | property | type | |
+//! |---|---|---|
+//! | `category`, `category_code`, `existence` | | as in `lanes` |
+//! | `cell`, `lane`, `part` | | as in `lanes` |
 
+mod dashes;
 pub mod lattice;
 mod layers;
 pub mod mercator;
@@ -74,6 +83,8 @@ pub const VECTOR_ZOOMS: std::ops::RangeInclusive<u8> = 12..=20;
 pub const WHOLE_FROM: u8 = 14;
 /// First zoom with the layer `stretches`.
 pub const STRETCHES_FROM: u8 = 15;
+/// First zoom with the layer `dashes`.
+pub const DASHES_FROM: u8 = 15;
 /// Units along the side of a tile.
 pub const EXTENT: u32 = 4096;
 /// How far beyond its side a tile shows lines, units: 16 pixels of a tile that is drawn 512 pixels wide.

@@ -11,6 +11,7 @@ use nalgebra::{Point2, Point3};
 use xxhash_rust::xxh3::xxh3_64;
 
 use crate::{
+    dashes::dashes,
     lattice::{Borders, PlaneCurve},
     mercator::world_from_wgs84,
     overview::{OVERVIEW_ZOOMS, Overview},
@@ -41,6 +42,8 @@ pub(crate) struct ProjectedLine {
     /// Boxes of the spline from every [`SPAN`]th control point to the next one.
     spans: Vec<PlaneBox>,
     pub(crate) stretches: Vec<Stretch>,
+    /// What is painted of it, as parameters of its spline; none where it is not dashed.
+    pub(crate) dashes: Vec<[f64; 2]>,
     pub(crate) known: LineKnown,
 }
 
@@ -122,7 +125,8 @@ impl ProjectedCell {
             // Of what is drawn from afar there is at most a vertex per control point and zoom.
             let points = line.points.len() * (size_of::<Point2<f64>>() + 2 * OVERVIEW_ZOOMS * size_of::<i64>());
             let spans = line.spans.len() * size_of::<PlaneBox>();
-            points + spans + line.stretches.len() * size_of::<Stretch>() + size_of::<ProjectedLine>() + 128
+            let dashes = line.dashes.len() * size_of::<[f64; 2]>();
+            points + spans + dashes + line.stretches.len() * size_of::<Stretch>() + size_of::<ProjectedLine>() + 128
         };
         self.lines.iter().map(line).sum::<usize>() + size_of::<Self>()
     }
@@ -161,6 +165,7 @@ impl ProjectedLine {
             whole: PlaneBox::around(&points),
             spans: spans.collect(),
             stretches: stretches(lane, points.len()),
+            dashes: if is_dashed(lane.category()) { dashes(&points, borders, side_m(cell)) } else { Vec::new() },
             known: LineKnown::of(cell, lane),
             points,
         })
@@ -190,6 +195,16 @@ impl ProjectedLine {
             }
         }
     }
+}
+
+/// Whether some of a line is dashes.
+fn is_dashed(category: v1::LaneCategory) -> bool {
+    category.as_str_name().contains("DASHED")
+}
+
+/// What the side of the plane is on the ground at a cell, metres: of the sphere that web mercator takes the earth for.
+fn side_m(cell: CellId) -> f64 {
+    2.0 * std::f64::consts::PI * 6_378_137.0 * cell.anchor().place().latitude_deg.to_radians().cos()
 }
 
 /// The control points of a line on the plane. An end on the cell's border is exactly where its neighbour has it.

@@ -6,6 +6,7 @@ use axum::{
     http::{HeaderMap, Uri},
     response::Response,
 };
+use lanemap_tiles::DASHES_FROM;
 use serde_json::{Value, json};
 
 use super::{entity_tag::EntityTag, link_base::LinkBase, problem::Problem, query::Parameters, tiles};
@@ -22,9 +23,8 @@ const UNKNOWN: &str = "#7fa3b5";
 
 /// Codes of the categories that are yellow.
 const YELLOW_CODES: std::ops::RangeInclusive<u8> = 7..=12;
-/// A dash and the gap after it, in widths of the line: 3 m and 6 m of a line that is 15 cm wide, shortened by half so that
-/// dashes show on a screen.
-const DASHES: [f64; 2] = [10.0, 20.0];
+/// A dash and the gap after it from afar, in widths of the line.
+const DASHES: [f64; 2] = [2.0, 4.0];
 
 /// One stroke of paint.
 struct Stroke {
@@ -56,11 +56,12 @@ const STROKES: [Stroke; 10] = [
 /// `GET /styles/lanes.json`
 pub(super) async fn style(base: LinkBase, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
     Parameters::read(&uri, &[])?;
-    let tag = EntityTag::of((PATH, base.as_str()));
+    let style = of_tiles(&base.link(tiles::PATH));
+    let tag = EntityTag::of((PATH, style.to_string()));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    Ok(tag.on(Json(of_tiles(&base.link(tiles::PATH)))))
+    Ok(tag.on(Json(style)))
 }
 
 /// The style of the tiles that a TileJSON describes.
@@ -74,13 +75,21 @@ fn of_tiles(tile_json: &str) -> Value {
     ];
     for Stroke { name, codes, dashed, aside } in STROKES {
         let mut shape = json!({"line-width": width(1.0)});
-        if dashed {
-            shape["line-dasharray"] = json!(DASHES);
-        }
         if aside != 0.0 {
             shape["line-offset"] = width(aside);
         }
-        layers.push(line(name, codes, &paint_colour, &shape));
+        if !dashed {
+            layers.push(line(name, codes, &paint_colour, &shape));
+            continue;
+        }
+        // A pattern begins anew in every tile: near the road, the tiles have the dashes themselves.
+        let mut near = line(name, codes, &paint_colour, &shape);
+        near["source-layer"] = json!("dashes");
+        near["minzoom"] = json!(DASHES_FROM);
+        shape["line-dasharray"] = json!(DASHES);
+        let mut far = line(&format!("{name}-far"), codes, &paint_colour, &shape);
+        far["maxzoom"] = json!(DASHES_FROM);
+        layers.extend([far, near]);
     }
     json!({
         "version": 8,

@@ -138,7 +138,8 @@ pub struct ServerConfig {
     /// Time after which a session without a stream leaves memory (its map stays readable), seconds; one that is over leaves
     /// at once.
     pub unload_after_s: u64,
-    /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for.
+    /// Memory for maps of drives that are not streaming, bytes; those not in it are read from the store when asked for. As much
+    /// again is for maps of drives that went on while a reader pages through them.
     pub max_cached_map_bytes: usize,
     /// Threads that fuse the shared map, 1 to 64.
     pub fuse_threads: usize,

@@ -92,6 +92,7 @@ use self::{
     link_base::{LinkBase, LinkSettings},
     ogc::{
         collection::{COLLECTIONS, Collection},
+        drive_walks::DriveWalks,
         feature_cache::FeatureCache,
         landing,
     },
@@ -141,6 +142,7 @@ struct Shared {
     extents: Extents,
     tiles: TileCache,
     cache: FeatureCache,
+    walks: DriveWalks,
     links: LinkSettings,
     api: Arc<Api>,
 }
@@ -148,6 +150,12 @@ struct Shared {
 impl FromRef<Shared> for FeatureCache {
     fn from_ref(shared: &Shared) -> Self {
         shared.cache.clone()
+    }
+}
+
+impl FromRef<Shared> for DriveWalks {
+    fn from_ref(shared: &Shared) -> Self {
+        shared.walks.clone()
     }
 }
 
@@ -190,6 +198,7 @@ pub fn router(state: ServeState) -> Router {
     let (links, limits) = (LinkSettings::of(&state.config), Arc::new(Limits::of(&state.config)));
     let tiles = TileCache::new(state.map.clone(), state.config.max_cached_tile_bytes);
     let cache = FeatureCache::new(state.config.max_cached_feature_bytes);
+    let walks = DriveWalks::new(state.config.max_cached_map_bytes);
     let (readers, described) = for_readers().into_parts();
     let (for_all, described_for_all) = for_all().into_parts();
     let api = Arc::new(Api::of(&[described_for_all, described].concat()));
@@ -203,7 +212,7 @@ pub fn router(state: ServeState) -> Router {
         .layer(middleware::from_fn_with_state(limits, limits::keep))
         .layer(middleware::from_fn(limits::head_as_get))
         .layer(cross_origin())
-        .with_state(Shared { state, extents: Extents::default(), tiles, cache, links, api })
+        .with_state(Shared { state, extents: Extents::default(), tiles, cache, walks, links, api })
 }
 
 /// What those may ask who may read: maps and metrics. Each route is described where it is added: see [`openapi`].

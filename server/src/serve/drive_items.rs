@@ -1,8 +1,10 @@
 //! `/collections/drives/items`: the lanes of all georeferenced sessions, as each drive alone saw them, a bounded page at a time.
 //!
-//! Pages are cut after a lane, not at an offset, so that a map that grows between two pages neither repeats nor hides a
-//! lane that was there all along: the cursor names the last lane of the page before, which is not repeated. Unlike the
-//! shared map's, earlier versions of a drive's map are not kept, so that each page is of now.
+//! The first page is of now. The link `next` names the state in which all drives then were ([`drive_walks`]), so that all pages
+//! of a walk are one state however drives go on meanwhile. Once that state is not held any more, or a drive of it was
+//! deleted, the walk is over (410). The cursor names the last lane of the page before, which is not repeated.
+//!
+//! [`drive_walks`]: super::ogc::drive_walks
 
 use std::sync::Arc;
 
@@ -26,43 +28,48 @@ use super::{
         MOST_COORDINATES,
         collection::DRIVE_LANES,
         cursor::{Cursor, DriveCursor},
+        drive_walks::{DriveWalk, DriveWalks},
         filters::Filtered,
         item_query::ItemQuery,
     },
     page::{PageFeatures, single},
     problem::{Problem, repeated},
     query::Parameters,
-    sessions::identity,
 };
-use crate::session::{PublishedMap, SessionId, SessionSummary, Sessions};
+use crate::session::{PublishedMap, SessionId};
 
 /// `GET /collections/drives/items`
 pub(super) async fn items(
     State(state): State<ServeState>,
     State(extents): State<Extents>,
+    State(walks): State<DriveWalks>,
     base: LinkBase,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let query = ItemQuery::read(&uri, &DRIVE_LANES)?;
     form::accepts_geojson(&headers)?;
-    let after = match query.cursor {
-        None => None,
-        Some(Cursor::Drives(after)) => Some(after),
+    let first = base.link(&format!("{}{}", DRIVE_LANES.items_path(), query.written_with(None)));
+    let over = |reason: &str| Problem::WalkOver { reason: reason.to_owned(), first };
+    let (walk, after) = match query.cursor {
+        None => (walks.begin(&state.sessions), None),
+        Some(Cursor::Drives(after)) => match walks.go_on(after.walk, &state.sessions) {
+            Some(walk) => (walk, Some(after)),
+            None => return Err(over("the state of the drives, of which this page is, is not held any more")),
+        },
         Some(Cursor::Map(_)) => return Err(query.foreign_cursor()),
     };
-    let summaries = state.sessions.list();
-    let identities: Vec<_> = summaries.iter().map(|summary| identity(summary)).collect();
-    let tag = EntityTag::of((identities, &query.written, base.as_str()));
+    let tag = EntityTag::of((walk.number, &query.written, base.as_str()));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
-    let drives = Drives { summaries, sessions: state.sessions, extents };
+    let drives = Drives { walk, extents };
     let (query, page) = in_background(move || {
         let page = drives.page(&query, after);
         (query, page)
     })
     .await?;
+    let page = page.map_err(|DriveGone| over("a drive of this walk was deleted, or went on after it had ended"))?;
     page.answer(&DRIVE_LANES, &query, &base, tag)
 }
 
@@ -92,58 +99,71 @@ pub(super) async fn item(
 
 /// Where the lanes of a page are found.
 struct Drives {
-    summaries: Vec<Arc<SessionSummary>>,
-    sessions: Sessions,
+    walk: Arc<DriveWalk>,
     extents: Extents,
 }
 
+/// The map of a drive is not what it was when the walk began.
+#[derive(Debug, PartialEq)]
+struct DriveGone;
+
 impl Drives {
     /// The page after a lane, or the first.
-    fn page(&self, query: &ItemQuery, after: Option<DriveCursor>) -> PageFeatures {
+    fn page(&self, query: &ItemQuery, after: Option<DriveCursor>) -> Result<PageFeatures, DriveGone> {
         let mut page = PageFeatures::default();
         let mut last = None;
-        for map in self.maps(query, after) {
-            for lane in lanes(&map, query, after) {
+        for drive in self.wanted(query, after) {
+            let map = match self.walk.map(drive) {
+                Some(map) => map,
+                // What of a first page is deleted meanwhile is not of it.
+                None if after.is_none() => continue,
+                None => return Err(DriveGone),
+            };
+            for lane in self.lanes(&map, query, after) {
                 let Some(found) = feature(&map, lane, Crs::Wgs84).filter(|found| is_wanted(found, query)) else {
                     continue;
                 };
                 if page.returned == query.limit || page.coordinates >= MOST_COORDINATES {
                     page.next = last.map(Cursor::Drives);
-                    return page;
+                    return Ok(page);
                 }
                 // A feature is always text: its keys are, and its numbers are finite.
                 page.push(found.geometry.size(), |out| out.extend(serde_json::to_vec(&found).unwrap_or_default()));
-                last = Some(DriveCursor::at(map.session, lane.id.0));
+                last = Some(DriveCursor::at(self.walk.number, map.session, lane.id.0));
             }
         }
-        page
+        Ok(page)
     }
 
-    /// The maps of georeferenced sessions from the cursor on that may enter the box, read one after the other.
-    fn maps(&self, query: &ItemQuery, after: Option<DriveCursor>) -> impl Iterator<Item = Arc<PublishedMap>> {
-        self.summaries
+    /// The georeferenced drives from the cursor on that may enter the box.
+    fn wanted(&self, query: &ItemQuery, after: Option<DriveCursor>) -> impl Iterator<Item = usize> {
+        self.walk
+            .summaries()
+            .filter(|(_, summary)| summary.georeference.is_some())
+            .filter(move |(_, summary)| after.is_none_or(|after| summary.session.to_key() >= after.session))
+            .filter(|(_, summary)| {
+                query.filters.session.as_ref().is_none_or(|name| *name == summary.session.to_string())
+            })
+            .filter(|(_, summary)| may_touch(query.bounds, || self.extents.of(summary)))
+            .map(|(drive, _)| drive)
+    }
+
+    /// The lanes of a map after the cursor that may be wanted.
+    fn lanes<'a>(
+        &self,
+        map: &'a PublishedMap,
+        query: &'a ItemQuery,
+        after: Option<DriveCursor>,
+    ) -> impl Iterator<Item = &'a MapLane> {
+        let walk = self.walk.number;
+        map.map
+            .lanes
             .iter()
-            .filter(|summary| summary.georeference.is_some())
-            .filter(move |summary| after.is_none_or(|after| summary.session.to_key() >= after.session))
-            .filter(|summary| query.filters.session.as_ref().is_none_or(|name| *name == summary.session.to_string()))
-            .filter(|summary| may_touch(query.bounds, || self.extents.of(summary)))
-            .filter_map(|summary| self.sessions.get(&summary.session))
+            .filter(move |lane| after.is_none_or(|after| DriveCursor::at(walk, map.session, lane.id.0) > after))
+            .filter(|lane| query.filters.pass(&filtered(lane)))
+            .filter(|lane| query.interval.is_none_or(|interval| interval.meets(lane.first_seen.0, lane.last_seen.0)))
+            .filter(|lane| may_touch(query.bounds, || around(map, lane)))
     }
-}
-
-/// The lanes of a map after the cursor that may be wanted.
-fn lanes<'a>(
-    map: &'a PublishedMap,
-    query: &'a ItemQuery,
-    after: Option<DriveCursor>,
-) -> impl Iterator<Item = &'a MapLane> {
-    map.map
-        .lanes
-        .iter()
-        .filter(move |lane| after.is_none_or(|after| DriveCursor::at(map.session, lane.id.0) > after))
-        .filter(|lane| query.filters.pass(&filtered(lane)))
-        .filter(|lane| query.interval.is_none_or(|interval| interval.meets(lane.first_seen.0, lane.last_seen.0)))
-        .filter(|lane| may_touch(query.bounds, || around(map, lane)))
 }
 
 fn filtered(lane: &MapLane) -> Filtered {
@@ -169,9 +189,12 @@ fn around(map: &PublishedMap, lane: &MapLane) -> Option<Bounds> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serve::{
-        features::feature_id,
-        sample::{georeference, placed, published},
+    use crate::{
+        serve::{
+            features::feature_id,
+            sample::{georeference, placed, published},
+        },
+        session::Sessions,
     };
 
     fn three_sessions() -> Vec<PublishedMap> {
@@ -193,13 +216,14 @@ mod tests {
         for map in three_sessions() {
             sessions.publish(map);
         }
-        let drives = Drives { summaries: sessions.list(), sessions, extents: Extents::default() };
+        let walk = DriveWalks::new(1 << 20).begin(&sessions);
+        let drives = Drives { walk, extents: Extents::default() };
         let query = ItemQuery::read(&uri, &DRIVE_LANES).unwrap();
         let after = query.cursor.map(|cursor| match cursor {
             Cursor::Drives(after) => after,
             Cursor::Map(_) => panic!("a cursor of the drives"),
         });
-        drives.page(&query, after)
+        drives.page(&query, after).unwrap()
     }
 
     fn features(page: &PageFeatures) -> Vec<serde_json::Value> {

@@ -36,6 +36,12 @@ impl EntityTag {
         Self { hash: hasher.finish(), made_at_us: None }
     }
 
+    /// The hash itself.
+    #[must_use]
+    pub fn number(&self) -> u64 {
+        self.hash
+    }
+
     /// The tag of an answer that also tells that it is made now; and now, microseconds since the Unix epoch.
     #[must_use]
     pub fn made_now(self) -> (Self, u64) {

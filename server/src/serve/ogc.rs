@@ -19,6 +19,7 @@ pub(super) mod collection;
 pub(super) mod control_points;
 pub(super) mod cursor;
 pub(super) mod datetime;
+pub(super) mod drive_walks;
 pub(super) mod feature_cache;
 pub(super) mod filters;
 pub(super) mod item_query;

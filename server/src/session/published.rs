@@ -127,6 +127,14 @@ impl PublishedMap {
         summary.lanes = map.lanes.len();
         Self { summary, map, way }
     }
+
+    /// Bytes that it takes in memory.
+    #[must_use]
+    pub fn memory_bytes(&self) -> usize {
+        let points: usize = self.map.lanes.iter().map(|lane| lane.control_points.len()).sum();
+        let lanes = 256 * self.map.lanes.len() + size_of::<ControlPoint>() * points;
+        size_of::<Self>() + lanes + size_of::<WayPoint>() * self.way.len()
+    }
 }
 
 impl Deref for PublishedMap {
@@ -174,10 +182,7 @@ struct MemoryWeight;
 
 impl Weighter<(SessionId, MapVersion), Arc<PublishedMap>> for MemoryWeight {
     fn weight(&self, _: &(SessionId, MapVersion), published: &Arc<PublishedMap>) -> u64 {
-        let points: usize = published.map.lanes.iter().map(|lane| lane.control_points.len()).sum();
-        let lanes = 256 * published.map.lanes.len() + size_of::<ControlPoint>() * points;
-        let bytes = size_of::<PublishedMap>() + lanes + size_of::<WayPoint>() * published.way.len();
-        bytes as u64
+        published.memory_bytes() as u64
     }
 }
 
@@ -214,6 +219,17 @@ impl Sessions {
     pub fn list(&self) -> Vec<Arc<SessionSummary>> {
         let entries = self.shared.entries.read().unwrap_or_else(PoisonError::into_inner);
         entries.values().map(|entry| entry.summary.load_full()).collect()
+    }
+
+    /// The same, each with its map where the session is awake.
+    pub(crate) fn list_with_awake(&self) -> Vec<(Arc<SessionSummary>, Option<Arc<PublishedMap>>)> {
+        let entries = self.shared.entries.read().unwrap_or_else(PoisonError::into_inner);
+        let with_map = |entry: &Arc<Entry>| match entry.awake.load_full() {
+            // Of one version with it.
+            Some(awake) => (Arc::new(awake.summary.clone()), Some(awake)),
+            None => (entry.summary.load_full(), None),
+        };
+        entries.values().map(with_map).collect()
     }
 
     /// Whether there is a session of this name.

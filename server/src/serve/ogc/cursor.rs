@@ -1,7 +1,8 @@
 //! Where a page begins: opaque text for clients, who take it from the link `next` and from nowhere else.
 //!
 //! A walk through a collection of the shared map is pinned to the revision at which it began, so that its pages are one
-//! map however it changes meanwhile, as long as the versions of its cells are kept.
+//! map however it changes meanwhile, as long as the versions of its cells are kept; a walk through the drives is pinned to
+//! the state in which they all were.
 
 use base64::{Engine, engine::general_purpose::URL_SAFE_NO_PAD};
 use lanemap_core::fleet::CellId;
@@ -31,16 +32,19 @@ pub(in crate::serve) struct MapCursor {
     pub(in crate::serve) matched: Option<u64>,
 }
 
-/// The last lane of the page before.
+/// The last lane of the page before, in a state of the drives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(in crate::serve) struct DriveCursor {
+    /// The walk: see [`super::drive_walks`].
+    pub(in crate::serve) walk: u64,
     pub(in crate::serve) session: [u8; 8],
     pub(in crate::serve) lane: u64,
 }
 
 impl DriveCursor {
-    pub(in crate::serve) fn at(session: SessionId, lane: u64) -> Self {
-        Self { session: session.to_key(), lane }
+    /// The place of a lane among those of all drives.
+    pub(in crate::serve) fn at(walk: u64, session: SessionId, lane: u64) -> Self {
+        Self { walk, session: session.to_key(), lane }
     }
 }
 
@@ -73,7 +77,7 @@ mod tests {
     fn a_cursor_survives_its_text_and_no_other_text_is_one() {
         let cell = CellId::new(8_718, 5_685).unwrap();
         let map = MapCursor { revision: MapRevision(7), cell, index: 300, question: u64::MAX, matched: Some(1_000) };
-        for cursor in [Cursor::Map(map), Cursor::Drives(DriveCursor { session: [1; 8], lane: 9 })] {
+        for cursor in [Cursor::Map(map), Cursor::Drives(DriveCursor { walk: 3, session: [1; 8], lane: 9 })] {
             let text = cursor.text();
             assert!(text.chars().all(|letter| letter.is_ascii_alphanumeric() || "-_".contains(letter)), "{text}");
             assert_eq!(Cursor::parse(&text), Ok(cursor));

@@ -115,7 +115,7 @@ mod tests {
     #[test]
     fn the_next_page_is_asked_the_same_question() {
         let first = read("limit=7&bbox=1%2C2,3,4").unwrap();
-        let cursor = Cursor::Drives(super::super::cursor::DriveCursor { session: [0; 8], lane: 1 });
+        let cursor = Cursor::Drives(super::super::cursor::DriveCursor { walk: 3, session: [0; 8], lane: 1 });
         let next = read(first.written_with(Some(&cursor)).trim_start_matches('?')).unwrap();
         assert_eq!(next.cursor, Some(cursor));
         assert_eq!(next.question(&LANES), first.question(&LANES));

@@ -15,10 +15,12 @@
 //! GeoJSON and FlatGeobuf take their cells one by one and stay small however large the map is. A tile shows lines of several
 //! cells, and lanes lie between lines of several: PMTiles, Lanelet2 and OpenDRIVE hold the whole map that they write.
 
+mod bridge;
 mod chain;
 mod direction;
 pub mod flatgeobuf;
 pub mod geojson;
+pub mod junction;
 pub mod lanelet2;
 pub mod map_line;
 pub mod opendrive;

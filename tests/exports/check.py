@@ -15,7 +15,7 @@ import numpy as np
 import pyproj
 import shapely
 
-from opendrive import read_with_asam_checker, read_with_carla, sampled
+from opendrive import junctions_join, read_with_asam_checker, read_with_carla, routes_of_carla, sampled
 from routing import lanelets_of
 
 #: Roads, each at an origin of its own: what the simulator calls them, and drives along them.
@@ -23,6 +23,7 @@ ROADS = {
     "straight": dict(origin=(45.06, 7.67), roads="straight", drives=2),
     "winding": dict(origin=(45.06, 7.72), roads="winding", drives=2),
     "split": dict(origin=(45.06, 7.77), roads="long-road", drives=2),
+    "town": dict(origin=(45.06, 7.82), roads="town", drives=4, length_km=0.9),
 }
 SEVEN_DECIMALS_M = 0.008  # half a unit of the seventh decimal of a degree, in both directions
 WITHIN_M = 0.01
@@ -56,7 +57,7 @@ class Map:
     def drive(self):
         for name, road in ROADS.items():
             drives = self.folder / name
-            arguments = ["--roads", road["roads"], "--drives", road["drives"], "--length-km", 0.4, "--seed", 3]
+            arguments = ["--roads", road["roads"], "--drives", road["drives"], "--length-km", road.get("length_km", 0.4), "--seed", 3]
             lanemap("simulate", "--out", drives, *arguments)
             origin = ",".join(map(str, road["origin"]))
             lanemap("replay", "--drives", drives, "--origin", origin, "--rate", "max", "--server", self.url)
@@ -84,6 +85,16 @@ class Map:
             features += page["features"]
             path = next((link["href"] for link in page["links"] if link["rel"] == "next"), None)
         return features
+
+    def places(self, name, plane):
+        """Where the vehicles were on a road, in metres of a plane: as their receivers say."""
+        origin = ROADS[name]["origin"]
+        local = pyproj.Proj(proj="ortho", lat_0=origin[0], lon_0=origin[1], ellps="WGS84")
+        to_plane = pyproj.Transformer.from_crs("EPSG:4326", plane, always_xy=True)
+        for segment in sorted((self.folder / name).glob("segment-*")):
+            poses = [json.loads(path.read_text())["pose"] for path in sorted(segment.glob("*.json"))]
+            places = np.array([[pose[0][3], pose[1][3]] for pose in poses])
+            yield np.column_stack(to_plane.transform(*local(*places.T, inverse=True)))
 
     def close(self):
         self.server.terminate()
@@ -186,9 +197,9 @@ def test_lanelet2(map_):
         lanelets.bounds_do_not_cross()
         print(f"  Lanelet2, {name}: {len(lanelets.map.laneletLayer)} lanelets, {apart * 1000:.1f} mm")
         # Where two drives did not give one line, at the fork and in a bend, the map has a lane that ends.
-        led, beside = {"straight": (1.0, 0.9), "winding": (0.8, 0.6), "split": (0.7, 0.6)}[name]
-        lanelets.follow_the_drives(map_.folder / name, 2, led, beside)
-        lanelets.have_side_by_side({"straight": 2, "winding": 2, "split": 4}[name])
+        led, beside = {"straight": (1.0, 0.9), "winding": (0.9, 0.6), "split": (0.7, 0.6), "town": (0.7, 0.6)}[name]
+        lanelets.follow_the_drives(map_.folder / name, 2, led, beside, leads_back=name == "town")
+        lanelets.have_side_by_side({"straight": 2, "winding": 2, "split": 4, "town": 1}[name])
 
 
 def test_opendrive(map_):
@@ -201,6 +212,11 @@ def test_opendrive(map_):
         assert heights(served) <= WITHIN_M
         waypoints = read_with_carla(path)
         print(f"  OpenDRIVE, {name}: {len(references)} roads, {apart * 1000:.1f} mm, {waypoints} waypoints of CARLA")
+        junctions, ways = junctions_join(path)
+        led, asked = routes_of_carla(path, map_.places(name, plane), 60.0)
+        print(f"  {junctions} junctions with {ways} ways; {led} routes of {asked}")
+        if name == "town":
+            assert junctions >= 4 and led >= 0.8 * asked > 20
         read_with_asam_checker(path)
 
 

@@ -1,4 +1,5 @@
 """Reads OpenDRIVE: as the standard says, with CARLA, and with ASAM's checker."""
+import json
 import math
 import pathlib
 import subprocess
@@ -51,7 +52,7 @@ def reference(road):
 
 
 def ascending(elements, way):
-    pieces = [numbers(element, way, "a", "b", "c", "d") for element in elements]
+    pieces = [numbers(element, way, "a", "b", "c", "d") for element in elements] or [[0.0] * 5]
     assert all(a[0] < b[0] for a, b in zip(pieces, pieces[1:]))
     return pieces
 
@@ -61,7 +62,7 @@ def sampled(path):
     document = etree.parse(str(path))
     plane = document.findtext("header/geoReference")
     references, borders = [], []
-    for road in document.iterfind("road"):
+    for road in document.iterfind("road[@junction='-1']"):
         at, length, _ = reference(road)
         heights = ascending(road.find("elevationProfile"), "s")
         offsets = ascending(road.iterfind("lanes/laneOffset"), "s")
@@ -104,6 +105,88 @@ def sampled(path):
         return worst
 
     return plane, references, borders, height_errors
+
+
+def lane_end(road, contact, lane):
+    """Both borders of a lane at an end of its road, the one nearer to lane 0 first; the height, and the road's heading."""
+    at, length, _ = reference(road)
+    s = 0.0 if contact == "start" else length
+    place, heading = at(s)
+    sections = road.findall("lanes/laneSection")
+    section = sections[0 if contact == "start" else -1]
+    within = s - float(section.get("s"))
+    t = cubic(ascending(road.iterfind("lanes/laneOffset"), "s"), s)
+    side = 1 if lane > 0 else -1
+    for number in range(side, lane + side, side):
+        before = t
+        width = section.find(f".//lane[@id='{number}']").iterfind("width")
+        t = t + side * cubic(ascending(width, "sOffset"), within)
+    normal = np.array([-math.sin(heading), math.cos(heading)])
+    return place + before * normal, place + t * normal, cubic(ascending(road.find("elevationProfile"), "s"), s), heading
+
+
+def junctions_join(path):
+    """Number of junctions, and of ways over them. Each way begins and ends where the lanes do that it joins, in their direction."""
+    document = etree.parse(str(path))
+    roads = {road.get("id"): road for road in document.iterfind("road")}
+    ways = 0
+    for junction in document.iterfind("junction"):
+        for connection in junction.iterfind("connection"):
+            connecting, incoming = roads[connection.get("connectingRoad")], roads[connection.get("incomingRoad")]
+            assert connecting.get("junction") == junction.get("id")
+            link = connection.find("laneLink")
+            own = connecting.find(f".//lane[@id='{link.get('to')}']")
+            assert own.find("link/predecessor").get("id") == link.get("from")
+            for end, name in [("start", "predecessor"), ("end", "successor")]:
+                of = connecting.find(f"link/{name}")
+                assert name == "successor" or roads[of.get("elementId")] is incoming
+                lane = int(own.find(f"link/{name}").get("id"))
+                beyond = roads[of.get("elementId")]
+                joint = beyond.find("link/" + ("predecessor" if of.get("contactPoint") == "start" else "successor"))
+                assert joint.get("elementType") == "junction" and joint.get("elementId") == junction.get("id")
+                here, there = lane_end(connecting, end, int(link.get("to"))), lane_end(beyond, of.get("contactPoint"), lane)
+                assert max(np.hypot(*(here[0] - there[0])), np.hypot(*(here[1] - there[1]))) < 0.02, (connecting.get("id"), end)
+                assert abs(here[2] - there[2]) < 0.01
+                # Which way the lane is driven there, by the rule of the road.
+                along = (lane < 0) == (beyond.get("rule") == "RHT")
+                assert along == ((of.get("contactPoint") == "end") == (end == "start"))
+                assert math.cos(here[3] - there[3]) * (1 if along else -1) > 0.99
+            ways += 1
+    return len(document.findall("junction")), ways
+
+
+def routes_of_carla(path, drives, apart_m):
+    """Along how many of the ways of some drives CARLA finds lanes that lead on, of those that begin and end on lanes."""
+    program = '''
+import carla, json, sys
+m = carla.Map("map", open(sys.argv[1]).read())
+led = asked = 0
+def lane_at(x, y):
+    found = m.get_waypoint(carla.Location(x, -y, 0))
+    place = found.transform.location
+    return found if ((place.x - x) ** 2 + (place.y + y) ** 2) ** 0.5 < 1.2 else None
+for here, there in json.load(sys.stdin):
+    start, end = lane_at(*here), lane_at(*there)
+    if start is None or end is None or start.is_junction or end.is_junction:
+        continue
+    asked += 1
+    frontier, found = [start], False
+    for _ in range(60):
+        found = any(((p.transform.location.x - there[0]) ** 2 + (p.transform.location.y + there[1]) ** 2) ** 0.5 < 2.0 for p in frontier)
+        if found or not frontier:
+            break
+        frontier = [after for p in frontier for after in p.next(2.0)][:64]
+    led += found
+print(led, asked)
+'''
+    pairs = []
+    for places in drives:
+        ways = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))
+        for way in np.arange(0.0, ways[-1] - apart_m, 15.0):
+            pairs.append([places[np.searchsorted(ways, at)].tolist() for at in (way, way + apart_m)])
+    done = subprocess.run([sys.executable, "-c", program, path], input=json.dumps(pairs), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return map(int, done.stdout.split())
 
 
 def read_with_carla(path):

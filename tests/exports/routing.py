@@ -66,8 +66,8 @@ class Lanelets:
                 return lanelet
         return None
 
-    def follow_the_drives(self, folder, least_lanes, least_share, least_beside):
-        """Where a vehicle went, a route leads along lanelets that are driven its way, and none leads back."""
+    def follow_the_drives(self, folder, least_lanes, least_share, least_beside, leads_back):
+        """Where a vehicle went, a route leads along lanelets that are driven its way, and none back but round a block."""
         asked = led = beside = 0
         for segment in sorted(folder.glob("segment-*")):
             poses = [json.loads(path.read_text())["pose"] for path in sorted(segment.glob("*.json"))]
@@ -82,7 +82,7 @@ class Lanelets:
                     continue
                 led += self.graph.getRoute(start, end) is not None
                 side_by_side = {each.id for each in (start, *self.graph.lefts(start), *self.graph.rights(start))}
-                if end.id not in side_by_side:
+                if end.id not in side_by_side and not leads_back:
                     assert self.graph.getRoute(end, start) is None
                 beside += 1 + len(self.graph.lefts(start)) + len(self.graph.rights(start)) >= least_lanes or (
                     1 + len(self.graph.adjacentLefts(start)) + len(self.graph.adjacentRights(start)) >= least_lanes

@@ -2,13 +2,17 @@
 //!
 //! Pieces that name each other over the border of a cell meet there. Besides, ends of lines of one kind that face each other
 //! within [`LONGEST_GAP_M`], each straight ahead of the other, are one line with a gap in what was seen: it is closed by a cubic
-//! that leaves the one and enters the other in their directions. Without it a lane would end there.
+//! that leaves the one and enters the other in their directions. Without it a lane would end there. Longer gaps are closed where
+//! another line leads beside them ([`bridge`](super::bridge)).
 
 use std::collections::BTreeMap;
 
 use nalgebra::{Point3, Vector3};
 
-use super::map_line::{Cubic, LoosePiece, MapLine, Piece, PieceName, mirrored};
+use super::{
+    bridge::{Bridges, OpenEnd, bridges},
+    map_line::{Cubic, LoosePiece, MapLine, Piece, PieceName, mirrored},
+};
 
 /// Longest gap that is closed, metres.
 const LONGEST_GAP_M: f64 = 6.0;
@@ -19,7 +23,7 @@ const MOST_ASIDE_PER_M: f64 = 0.05;
 const LEAST_COS: f64 = 0.98;
 
 /// An end of a piece: its index, and whether it is the last one.
-type PieceEnd = (usize, bool);
+pub(super) type PieceEnd = (usize, bool);
 
 /// Chains pieces that name each other into lines; in the order of the names of their first pieces.
 ///
@@ -27,6 +31,8 @@ type PieceEnd = (usize, bool);
 pub(super) fn chains(pieces: &[LoosePiece]) -> Vec<MapLine> {
     let mut joined = joins(pieces);
     close_gaps(pieces, &mut joined);
+    let bridges = bridges(pieces, &open_ends(pieces, &joined));
+    joined.extend(bridges.iter().map(|(here, (there, _))| (*here, *there)));
     let mut taken = vec![false; pieces.len()];
     let mut lines = Vec::new();
     let mut order: Vec<usize> = (0..pieces.len()).collect();
@@ -37,7 +43,7 @@ pub(super) fn chains(pieces: &[LoosePiece]) -> Vec<MapLine> {
         }
         let (first, closed) = first_of(start, &joined);
         let chain = follow(first, &joined, &mut taken);
-        lines.push(line(pieces, &chain, closed));
+        lines.push(line(pieces, &chain, &bridges, closed));
     }
     lines.sort_by(|a, b| a.pieces[0].name.cmp(&b.pieces[0].name));
     lines
@@ -80,8 +86,8 @@ impl LoosePiece {
     }
 }
 
-/// Joins ends that face each other over a short gap: the nearest two first, each once.
-fn close_gaps(pieces: &[LoosePiece], joined: &mut BTreeMap<PieceEnd, PieceEnd>) {
+/// The ends that meet no other, from west to east.
+fn open_ends(pieces: &[LoosePiece], joined: &BTreeMap<PieceEnd, PieceEnd>) -> Vec<OpenEnd> {
     let mut ends = Vec::new();
     for (at, piece) in pieces.iter().enumerate() {
         for is_last in [false, true] {
@@ -93,6 +99,21 @@ fn close_gaps(pieces: &[LoosePiece], joined: &mut BTreeMap<PieceEnd, PieceEnd>) 
         }
     }
     ends.sort_by(|a, b| a.1.x.total_cmp(&b.1.x).then(a.0.cmp(&b.0)));
+    ends
+}
+
+/// Whether two pieces are painted alike, seen in one direction: the one to its end, the other from there.
+pub(super) fn is_one_kind(pieces: &[LoosePiece], here: &PieceEnd, there: &PieceEnd) -> bool {
+    let category = |end: &PieceEnd, forwards: bool| {
+        let category = pieces[end.0].category;
+        if end.1 == forwards { category } else { mirrored(category) }
+    };
+    category(here, true) == category(there, false)
+}
+
+/// Joins ends that face each other over a short gap: the nearest two first, each once.
+fn close_gaps(pieces: &[LoosePiece], joined: &mut BTreeMap<PieceEnd, PieceEnd>) {
+    let ends = open_ends(pieces, joined);
     let mut candidates = Vec::new();
     for (index, (here, place, onwards)) in ends.iter().enumerate() {
         for (there, other_place, other_onwards) in
@@ -103,17 +124,12 @@ fn close_gaps(pieces: &[LoosePiece], joined: &mut BTreeMap<PieceEnd, PieceEnd>) 
             let is_ahead = |gap: &Vector3<f64>, onwards: &Vector3<f64>| {
                 gap.dot(onwards) >= 0.0 && (gap - onwards * gap.dot(onwards)).norm() <= most_aside_m
             };
-            // Seen in one direction: the one piece to its end, the other from there.
-            let category = |end: &PieceEnd, forwards: bool| {
-                let category = pieces[end.0].category;
-                if end.1 == forwards { category } else { mirrored(category) }
-            };
             if here.0 != there.0
                 && gap.norm() <= LONGEST_GAP_M
                 && onwards.dot(other_onwards) <= -LEAST_COS
                 && is_ahead(&gap, onwards)
                 && is_ahead(&-gap, other_onwards)
-                && category(here, true) == category(there, false)
+                && is_one_kind(pieces, here, there)
             {
                 candidates.push((gap.norm(), *here, *there));
             }
@@ -166,7 +182,7 @@ fn follow(first: (usize, bool), joined: &BTreeMap<PieceEnd, PieceEnd>, taken: &m
     chain
 }
 
-fn line(pieces: &[LoosePiece], chain: &[(usize, bool)], closed: bool) -> MapLine {
+fn line(pieces: &[LoosePiece], chain: &[(usize, bool)], bridges: &Bridges, closed: bool) -> MapLine {
     let against: f64 = chain
         .iter()
         .map(|(at, backwards)| pieces[*at].segments.len() as f64 * if *backwards { 1.0 } else { -1.0 })
@@ -178,6 +194,7 @@ fn line(pieces: &[LoosePiece], chain: &[(usize, bool)], closed: bool) -> MapLine
     };
     let mut segments: Vec<Cubic> = Vec::new();
     let mut named: Vec<Piece> = Vec::new();
+    let mut guessed_m = 0.0;
     for (at, reversed) in chain {
         let piece = &pieces[at];
         let own: Vec<Cubic> = if reversed {
@@ -185,11 +202,16 @@ fn line(pieces: &[LoosePiece], chain: &[(usize, bool)], closed: bool) -> MapLine
         } else {
             piece.segments.clone()
         };
-        if let (Some(before), Some(last)) = (named.last_mut(), segments.last())
-            && let Some(cubic) = connector(last, &own[0])
-        {
-            segments.push(cubic);
-            before.segments += 1;
+        if let (Some(before), Some(last)) = (named.last_mut(), segments.last()) {
+            // From this piece back, as it was found from its end, or over a short gap.
+            let back = bridges.get(&(at, reversed)).map(|(_, way)| way);
+            let gap: Vec<Cubic> = match back {
+                Some(way) => way.iter().rev().map(|cubic| cubic.part(1.0, 0.0)).collect(),
+                None => connector(last, &own[0]).into_iter().collect(),
+            };
+            guessed_m += gap.iter().map(Cubic::length_m).sum::<f64>();
+            before.segments += gap.len();
+            segments.extend(gap);
         }
         named.push(Piece {
             name: piece.name.clone(),
@@ -203,7 +225,7 @@ fn line(pieces: &[LoosePiece], chain: &[(usize, bool)], closed: bool) -> MapLine
     }
     let ends = segments.first().zip(segments.last()).map(|(first, last)| last.point(1.0) - first.point(0.0));
     let meets = ends.is_some_and(|gap| gap.norm() < 0.01) && segments.len() > 4;
-    MapLine { segments, pieces: named, closed: closed || meets }
+    MapLine { segments, pieces: named, closed: closed || meets, guessed_m }
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 //! Format: Poggenhans et al., *Lanelet2: A High-Definition Map Framework* (2018), and its `LinestringTagging.md` and
 //! `LaneletAndAreaTagging.md`. A [road](super::road) gives the lanelets: each section's lanes lie between its borders, so neighbours have
 //! a line string in common, and a lanelet follows another where its bounds begin at the nodes at which the other's end. Where
-//! a line begins or ends beside another (a lane opens or closes), the line string of the one is led to the node of the other.
+//! a line begins or ends beside another (a lane opens or closes), the line string of the one is led to the node of the other. Over a
+//! [junction](super::junction) lanelets lead between virtual line strings.
 //!
 //! Nodes have latitude and longitude, and the tags `local_x`, `local_y` and `ele`: metres in the plane whose PROJ string stands in
 //! the file's first comment, and metres above the ellipsoid. Ids are hashes of the names that the lines have in the shared map, so
@@ -11,6 +12,7 @@
 //!
 //! `location` is `urban`, the careful choice: a map of lines does not say. Speed limits are left to who knows them.
 
+mod crossing;
 mod ids;
 
 use std::{
@@ -20,14 +22,19 @@ use std::{
 };
 
 use lanemap_core::Category;
+use nalgebra::Point3;
 use quick_xml::{
     Writer,
     events::{BytesDecl, BytesText, Event},
 };
 
-use self::ids::Ids;
+use self::{
+    crossing::{Crossing, cross},
+    ids::Ids,
+};
 use super::{
     ExportError, LaneOptions, Summary,
+    junction::joints,
     map_line::{MapLine, MapLines},
     road::{Border, GapKind, Road, Section, Travel, roads},
 };
@@ -48,6 +55,7 @@ struct Drawing {
     nodes: BTreeMap<NodeKey, f64>,
     ways: BTreeMap<WayKey, Vec<NodeKey>>,
     lanelets: Vec<Lanelet>,
+    crossings: Vec<Crossing>,
 }
 
 struct Lanelet {
@@ -61,7 +69,8 @@ struct Lanelet {
 /// The output cannot be written.
 pub fn write(map: &MapLines, options: LaneOptions, out: &mut dyn Write) -> Result<Summary, ExportError> {
     let roads = roads(map, options);
-    let drawing = draw(map, &roads);
+    let mut drawing = draw(map, &roads);
+    cross(map, &roads, &joints(map, &roads), &mut drawing);
     let mut file = File {
         map,
         roads: &roads,
@@ -70,7 +79,7 @@ pub fn write(map: &MapLines, options: LaneOptions, out: &mut dyn Write) -> Resul
         writer: Writer::new_with_indent(out, b' ', 1),
     };
     file.write()?;
-    Ok(Summary { lines: map.pieces, lanes: drawing.lanelets.len() as u64, tiles: 0 })
+    Ok(Summary { lines: map.pieces, lanes: (drawing.lanelets.len() + drawing.crossings.len()) as u64, tiles: 0 })
 }
 
 /// Line strings of every border, and the lanelets between them.
@@ -196,6 +205,18 @@ impl Drawing {
         self.nodes.entry(key).or_insert(parameter);
         key
     }
+
+    /// Makes one node of two.
+    fn merge(&mut self, kept: NodeKey, gone: NodeKey) {
+        if kept == gone {
+            return;
+        }
+        for keys in self.ways.values_mut() {
+            keys.iter_mut().filter(|key| **key == gone).for_each(|key| *key = kept);
+            keys.dedup();
+        }
+        self.nodes.remove(&gone);
+    }
 }
 
 /// Joins the bounds of lanes that go on in the next section where these are other lines.
@@ -261,6 +282,15 @@ impl File<'_> {
                 write_node(writer, id, map, line, *parameter)?;
                 node_ids.insert(*key, id);
             }
+            let mut between_ids = Vec::new();
+            for line in drawing.crossings.iter().flat_map(Crossing::lines) {
+                let name = |index| format!("c {} {} {index}", node_ids[&line.first], node_ids[&line.last]);
+                let named: Vec<u64> = (0..line.between.len()).map(|index| ids.next(&name(index))).collect();
+                for (id, point) in named.iter().zip(&line.between) {
+                    write_point(writer, *id, map, point)?;
+                }
+                between_ids.push(named);
+            }
             let mut way_ids = BTreeMap::new();
             for (key, nodes) in &drawing.ways {
                 let border = &roads[key.0].sections[key.1].borders[key.2];
@@ -272,13 +302,26 @@ impl File<'_> {
                 let id = ids.next(&format!("w {} {}", name(nodes.first()), name(nodes.last())));
                 way_ids.insert(*key, id);
                 let nodes = nodes.iter().filter_map(|node| node_ids.get(node).copied());
-                write_way(writer, id, nodes, line.piece_at(0.5 * (border.from + border.to)).category)?;
+                let marking = marking(line.piece_at(0.5 * (border.from + border.to)).category);
+                write_way(writer, id, nodes, &marking)?;
+            }
+            let mut crossed = Vec::new();
+            for (line, between) in drawing.crossings.iter().flat_map(Crossing::lines).zip(between_ids) {
+                let (first, last) = (node_ids[&line.first], node_ids[&line.last]);
+                let id = ids.next(&format!("v {first} {last}"));
+                let nodes = [first].into_iter().chain(between).chain([last]);
+                write_way(writer, id, nodes, &Marking { kind: "virtual", subtype: None, color: None })?;
+                crossed.push(id);
             }
             for lanelet in &drawing.lanelets {
                 if let (Some(left), Some(right)) = (way_ids.get(&lanelet.left), way_ids.get(&lanelet.right)) {
                     let id = ids.next(&format!("l {left} {right}"));
                     write_lanelet(writer, id, *left, *right)?;
                 }
+            }
+            for sides in crossed.chunks_exact(2) {
+                let id = ids.next(&format!("l {} {}", sides[0], sides[1]));
+                write_lanelet(writer, id, sides[0], sides[1])?;
             }
             Ok(())
         })?;
@@ -305,8 +348,11 @@ fn write_node<W: Write>(
     line: &MapLine,
     parameter: f64,
 ) -> io::Result<()> {
-    let point = line.point(parameter);
-    let place = map.plane.unproject(&point);
+    write_point(writer, id, map, &line.point(parameter))
+}
+
+fn write_point<W: Write>(writer: &mut Writer<W>, id: u64, map: &MapLines, point: &Point3<f64>) -> io::Result<()> {
+    let place = map.plane.unproject(point);
     let (id, latitude, longitude) =
         (id.to_string(), format!("{:.10}", place.latitude_deg), format!("{:.10}", place.longitude_deg));
     let attributes = [
@@ -329,7 +375,7 @@ fn write_way<W: Write>(
     writer: &mut Writer<W>,
     id: u64,
     nodes: impl Iterator<Item = u64>,
-    category: Category,
+    marking: &Marking,
 ) -> io::Result<()> {
     let id = id.to_string();
     let attributes = [("id", id.as_str()), ("visible", "true"), ("version", "1")];
@@ -338,7 +384,6 @@ fn write_way<W: Write>(
         for node in nodes {
             writer.create_element("nd").with_attribute(("ref", node.to_string().as_str())).write_empty()?;
         }
-        let marking = marking(category);
         write_tag(writer, "type", marking.kind)?;
         if let Some(subtype) = marking.subtype {
             write_tag(writer, "subtype", subtype)?;

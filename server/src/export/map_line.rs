@@ -122,6 +122,8 @@ pub struct MapLine {
     pub pieces: Vec<Piece>,
     /// Whether it ends where it begins.
     pub closed: bool,
+    /// Length of the gaps in it that were closed, metres.
+    pub guessed_m: f64,
 }
 
 /// Lines in one plane.
@@ -351,7 +353,7 @@ pub(super) mod tests {
         let name = PieceName { cell: "14-8718-5685".into(), id: name.into(), part: 0 };
         let piece =
             Piece { name, category, existence: 0.9, first_segment: 0, segments: segments.len(), reversed: false };
-        MapLine { segments, pieces: vec![piece], closed: false }
+        MapLine { segments, pieces: vec![piece], closed: false, guessed_m: 0.0 }
     }
 
     /// Points 3 m apart on an arc to the left of a radius, `aside_m` to the left of it; straight where the radius is infinite.

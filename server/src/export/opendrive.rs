@@ -4,12 +4,14 @@
 //! cubic, is a `paramPoly3` in the segment's own frame: the same curve, not a fit. The elevation profile is the segment's own
 //! height polynomial. The other lines are the borders of lanes: their distance from the reference line is followed by cubics
 //! to within [`WIDTH_ERROR_M`] in plan, and their paint is the `roadMark` on the outer side of a lane. `laneOffset` puts lane 0 on the
-//! line that separates the ways of travel, so that lanes are driven as the rule of the road has it.
+//! line that separates the ways of travel, so that lanes are driven as the rule of the road has it. Over a [junction](super::junction),
+//! where no line is, a connecting road of one lane leads from each lane to each that it leads on in; lanes that
+//! touch are linked.
 //!
 //! `geoReference` is the PROJ string of the map's plane; heights are above the ellipsoid. Not in it: the slope across a road
-//! (borders have the height of the reference line), junctions and links between roads, signs and speed limits, which a map of lines
-//! does not have.
+//! (borders have the height of the reference line), signs, priorities and speed limits, which a map of lines does not have.
 
+mod connecting;
 mod profile;
 mod written;
 
@@ -19,11 +21,13 @@ use lanemap_core::Category;
 use quick_xml::Writer;
 
 use self::{
+    connecting::{Links, write_connecting_roads, write_junctions},
     profile::{Piece, fitted},
     written::{attribute, write_cubics, write_header},
 };
 use super::{
     ExportError, LaneOptions, Summary, TrafficSide,
+    junction::{RoadEnd, joints},
     map_line::{Cubic, MapLines, mirrored},
     road::{Border, GapKind, NARROWEST_LANE_M, Road, Section, Travel, abreast, roads},
 };
@@ -43,17 +47,15 @@ pub fn write(map: &MapLines, options: LaneOptions, out: &mut dyn Write) -> Resul
     let mut summary = Summary { lines: map.pieces, ..Summary::default() };
     written::document(&mut writer, |writer| {
         write_header(writer, map)?;
-        let mut id = 0_usize;
-        for road in &roads {
-            let drawn = DrawnRoad::of(map, road, options);
-            if drawn.length_m() < SHORTEST_ROAD_M {
-                continue;
-            }
-            id += 1;
-            drawn.write(writer, id)?;
-            summary.lanes += road.sections.iter().map(|section| section.lanes() as u64).sum::<u64>();
+        let drawn: Vec<DrawnRoad> = roads.iter().map(|road| DrawnRoad::of(map, road, options)).collect();
+        let links = Links::of(&joints(map, &roads), &drawn, options.traffic);
+        for (index, road) in drawn.iter().enumerate() {
+            let Some(id) = links.road_id(index) else { continue };
+            road.write(writer, id, &links, index)?;
+            summary.lanes += road.road.sections.iter().map(|section| section.lanes() as u64).sum::<u64>();
         }
-        Ok(())
+        write_connecting_roads(writer, &links, &drawn)?;
+        write_junctions(writer, &links)
     })?;
     out.write_all(b"\n")?;
     Ok(summary)
@@ -76,6 +78,8 @@ struct DrawnRoad<'a> {
     map: &'a MapLines,
     road: &'a Road,
     geometries: Vec<Geometry>,
+    /// Of each section the border on which lane 0 lies.
+    separators: Vec<usize>,
     traffic: TrafficSide,
 }
 
@@ -93,7 +97,20 @@ impl<'a> DrawnRoad<'a> {
             geometries.push(Geometry { from: *start, to: end, s_m, length_m, cubic: *cubic });
             s_m += length_m;
         }
-        Self { map, road, geometries, traffic: options.traffic }
+        let mut drawn = Self { map, road, geometries, separators: Vec::new(), traffic: options.traffic };
+        for section in &road.sections {
+            let before = drawn.separators.last().zip(drawn.separators.len().checked_sub(1));
+            let before = before.map(|(border, index)| road.sections[index].borders[*border].line);
+            let separator = drawn.separator(section, before);
+            drawn.separators.push(separator);
+        }
+        drawn
+    }
+
+    /// Number of the lane in a gap, at an end of the road.
+    fn lane_at(&self, end: RoadEnd, gap: usize) -> i64 {
+        let index = if end.is_last { self.separators.len() - 1 } else { 0 };
+        lane_id(gap, self.separators[index])
     }
 
     fn length_m(&self) -> f64 {
@@ -157,7 +174,7 @@ impl<'a> DrawnRoad<'a> {
         (0..section.borders.len()).min_by_key(|border| preference(*border)).unwrap_or_default()
     }
 
-    fn write<W: Write>(&self, writer: &mut Writer<W>, id: usize) -> io::Result<()> {
+    fn write<W: Write>(&self, writer: &mut Writer<W>, id: usize, links: &Links, index: usize) -> io::Result<()> {
         let rule = if self.traffic == TrafficSide::Right { "RHT" } else { "LHT" };
         let (length, id) = (attribute(self.length_m()), id.to_string());
         let line = &self.map.lines[self.road.line];
@@ -172,6 +189,7 @@ impl<'a> DrawnRoad<'a> {
         ];
         let element = writer.create_element("road").with_attributes(attributes);
         element.write_inner_content(|writer| {
+            links.write(writer, index)?;
             writer.create_element("planView").write_inner_content(|writer| {
                 self.geometries.iter().try_for_each(|geometry| written::geometry(writer, geometry))
             })?;
@@ -179,37 +197,36 @@ impl<'a> DrawnRoad<'a> {
                 let heights = self.geometries.iter().map(elevation).collect::<Vec<_>>();
                 write_cubics(writer, "elevation", "s", &heights, 0.0)
             })?;
-            writer.create_element("lanes").write_inner_content(|writer| self.write_lanes(writer)).map(drop)
+            writer
+                .create_element("lanes")
+                .write_inner_content(|writer| self.write_lanes(writer, links, index))
+                .map(drop)
         })?;
         Ok(())
     }
 
-    fn write_lanes<W: Write>(&self, writer: &mut Writer<W>) -> io::Result<()> {
-        let mut separators = Vec::with_capacity(self.road.sections.len());
-        for section in &self.road.sections {
-            let before = separators.last().map(|(_, line)| *line);
-            let border = self.separator(section, before);
-            separators.push((border, section.borders[border].line));
-        }
+    fn write_lanes<W: Write>(&self, writer: &mut Writer<W>, links: &Links, road: usize) -> io::Result<()> {
+        let separators = &self.separators;
         let followed: Vec<Vec<Vec<Piece>>> = self
             .road
             .sections
             .iter()
             .map(|section| section.borders.iter().map(|border| self.followed(section, border)).collect())
             .collect();
-        let offsets =
-            separators.iter().zip(&followed).flat_map(|((separator, _), followed)| followed[*separator].clone());
+        let offsets = separators.iter().zip(&followed).flat_map(|(separator, followed)| followed[*separator].clone());
         write_cubics(writer, "laneOffset", "s", &offsets.collect::<Vec<_>>(), 0.0)?;
         for (index, section) in self.road.sections.iter().enumerate() {
             let s = attribute(self.s_of(section.from));
             let around = Neighbours {
-                before: index.checked_sub(1).map(|before| (&self.road.sections[before], separators[before].0)),
-                after: self.road.sections.get(index + 1).map(|after| (after, separators[index + 1].0)),
+                before: index.checked_sub(1).map(|before| (&self.road.sections[before], separators[before])),
+                after: self.road.sections.get(index + 1).map(|after| (after, separators[index + 1])),
+                links,
+                road,
             };
             let lanes = SectionLanes {
                 drawn: self,
                 section,
-                separator: separators[index].0,
+                separator: separators[index],
                 followed: &followed[index],
                 s_m: self.s_of(section.from),
                 around,
@@ -229,9 +246,13 @@ fn elevation(geometry: &Geometry) -> Piece {
 }
 
 /// The sections beside a section, with their separators.
+#[derive(Clone, Copy)]
 struct Neighbours<'a> {
     before: Option<(&'a Section, usize)>,
     after: Option<(&'a Section, usize)>,
+    /// Where the first and the last section lead on.
+    links: &'a Links,
+    road: usize,
 }
 
 /// The lanes of a section while they are written.
@@ -299,12 +320,19 @@ impl SectionLanes<'_> {
     }
 
     fn write_link<W: Write>(&self, writer: &mut Writer<W>, gap: usize) -> io::Result<()> {
-        let before = self.around.before.and_then(|(section, separator)| {
-            let found = section.gaps.iter().position(|other| other.goes_on_in == Some(gap))?;
-            Some(lane_id(found, separator))
-        });
-        let after =
-            self.around.after.and_then(|(_, separator)| Some(lane_id(self.section.gaps[gap].goes_on_in?, separator)));
+        let Neighbours { before, after, links, road } = self.around;
+        let linked = |is_last: bool| links.lane_beyond(RoadEnd { road, is_last }, gap);
+        let before = match before {
+            Some((section, separator)) => {
+                let found = section.gaps.iter().position(|other| other.goes_on_in == Some(gap));
+                found.map(|found| lane_id(found, separator))
+            }
+            None => linked(false),
+        };
+        let after = match after {
+            Some((_, separator)) => self.section.gaps[gap].goes_on_in.map(|next| lane_id(next, separator)),
+            None => linked(true),
+        };
         if before.is_none() && after.is_none() {
             return Ok(());
         }

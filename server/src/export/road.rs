@@ -117,8 +117,9 @@ pub fn roads(map: &MapLines, options: LaneOptions) -> Vec<Road> {
     let mut survey = Survey::of(&map.lines);
     let mut order: Vec<(usize, f64)> =
         map.lines.iter().enumerate().map(|(index, line)| (index, line.length_m())).collect();
-    // Lines that may bound no lane come last, so that they take nothing from others.
-    let last = |index: usize| map.lines[index].existence() < LEAST_EXISTENCE;
+    // Lines that may bound no lane come last, so that they take nothing from others; before them those with gaps, which
+    // follow others.
+    let last = |index: usize| (map.lines[index].existence() < LEAST_EXISTENCE, map.lines[index].guessed_m > 0.0);
     order.sort_by(|a, b| last(a.0).cmp(&last(b.0)).then(b.1.total_cmp(&a.1)).then(a.0.cmp(&b.0)));
     let mut roads = Vec::new();
     for (line, _) in order {
@@ -132,7 +133,22 @@ pub fn roads(map: &MapLines, options: LaneOptions) -> Vec<Road> {
             decide(&map.lines, &mut road, options.traffic);
             forget_short_ends(&map.lines, &mut road);
             connect(&mut road);
-            roads.push(road);
+            roads.extend(parted(road));
+        }
+    }
+    roads
+}
+
+/// Parts a road where its lanes begin and end: lanes lead on from the end of a road.
+fn parted(road: Road) -> Vec<Road> {
+    let mut roads: Vec<Road> = Vec::new();
+    for section in road.sections {
+        let has_lanes = section.lanes() > 0;
+        match roads.last_mut() {
+            Some(last) if last.sections.last().is_some_and(|before| (before.lanes() > 0) == has_lanes) => {
+                last.sections.push(section);
+            }
+            _ => roads.push(Road { line: road.line, sections: vec![section] }),
         }
     }
     roads

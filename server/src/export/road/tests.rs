@@ -30,8 +30,8 @@ fn two_way(radius_m: f64) -> MapLines {
 
 /// Which way lanes of a section are driven on the earth: whether as `line` runs, from the left of that line to its right.
 fn driven(roads: &[Road], map: &MapLines, line: usize) -> Vec<bool> {
-    let road = &roads[0];
-    let section = road.sections.iter().find(|section| section.lanes() > 0).expect("a road has lanes");
+    let mut sections = roads.iter().flat_map(|road| &road.sections);
+    let section = sections.find(|section| section.lanes() > 0).expect("a road has lanes");
     let along = section.borders.iter().find(|border| border.line == line).unwrap().along;
     let lanes = section.gaps.iter().filter(|gap| gap.kind == GapKind::Lane);
     let mut driven: Vec<bool> = lanes.map(|gap| (gap.travel == Travel::Along) == along).collect();

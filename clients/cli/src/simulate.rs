@@ -93,7 +93,10 @@ fn not_negative(text: &str) -> Result<f64, String> {
 /// Simulates and writes.
 pub fn run(args: &SimulateArgs) -> anyhow::Result<ExitCode> {
     let written = match args.roads.world() {
-        Some(world) => write_fleet(&args.out, &fleet_scenario(args, world)?.fleet(Seed(args.seed))),
+        Some(world) => {
+            let fleet = fleet_scenario(args, world)?.fleet(Seed(args.seed));
+            write_fleet(&args.out, &fleet, args.fleet.drives_of_part(args.drives))
+        }
         None => write_simulation(&args.out, &scenario(args)?),
     };
     let written = written.context("the simulation cannot be written; --out must name a folder that can be made")?;

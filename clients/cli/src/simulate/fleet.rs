@@ -1,5 +1,7 @@
 //! Fleets of `lanemap simulate`: which world, which traffic, what changes, what is wrong.
 
+use std::{ops::Range, str::FromStr};
+
 use anyhow::bail;
 use clap::Args;
 use lanemap_simulator::{
@@ -42,12 +44,34 @@ pub struct FleetArgs {
     /// Construction zones that come and go
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1000))]
     zones: u32,
+    /// Write only part I of N of the drives: a large fleet needs little disk where each part is replayed before the next
+    #[arg(long, value_name = "I/N")]
+    part: Option<Part>,
     /// Share of drives with a gross error of GNSS, odometry or camera mount, percent
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0, value_parser = percent)]
     gross_percent: f64,
     /// Share of drives whose detections all lie one lane aside, percent
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0, value_parser = percent)]
     adversarial_percent: f64,
+}
+
+/// A part of some parts, counted from 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Part {
+    number: u32,
+    of: u32,
+}
+
+impl FromStr for Part {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers = text.split_once('/').and_then(|(number, of)| Some((number.parse().ok()?, of.parse().ok()?)));
+        match numbers {
+            Some((number, of)) if (1..=of).contains(&number) && of <= 1000 => Ok(Self { number, of }),
+            _ => Err(format!("{text:?} is not I/N with I from 1 to N and N at most 1000")),
+        }
+    }
 }
 
 /// Where a fleet drives.
@@ -66,8 +90,16 @@ impl FleetArgs {
         options.iter().any(Option::is_some)
             || self.interval_h.is_some()
             || self.both_directions
+            || self.part.is_some()
             || self.changes + self.zones > 0
             || self.gross_percent + self.adversarial_percent > 0.0
+    }
+
+    /// The numbers of the drives that are written, of so many.
+    pub fn drives_of_part(&self, drives: u32) -> Range<u32> {
+        let Part { number, of } = self.part.unwrap_or(Part { number: 1, of: 1 });
+        // The products stay below a million.
+        (number - 1) * drives / of..number * drives / of
     }
 
     /// What to simulate, but for the speeds of the drives.

@@ -5,7 +5,7 @@
 //! earth, and of each drive its start, its road and what is wrong with it. Annotations have every line in the camera's
 //! view, also behind other vehicles; detections are not there. `OpenLane` has no room for occlusions and for odometry.
 
-use std::path::Path;
+use std::{ops::Range, path::Path};
 
 use lanemap_core::evaluation::GroundFrame;
 use lanemap_openlane::{OpenLaneError, write_annotation, write_result};
@@ -20,14 +20,15 @@ use crate::{
     truth_map::{TrueLine, TruthMap},
 };
 
-/// Simulates a fleet and writes it below `root`, which is made where it is not there, frame by frame.
+/// Simulates some drives of a fleet, by their numbers, and writes them below `root`, which is made where it is not there, frame
+/// by frame.
 ///
 /// # Errors
 /// A folder or file that cannot be written.
-pub fn write_fleet(root: &Path, fleet: &Fleet) -> Result<Written, OpenLaneError> {
+pub fn write_fleet(root: &Path, fleet: &Fleet, drives: Range<u32>) -> Result<Written, OpenLaneError> {
     let mut written = Written::default();
     let mut index = Vec::new();
-    for drive in fleet.drives() {
+    for drive in drives.map(|number| fleet.drive(number)) {
         written.drives += 1;
         written.frames += drive.states().len();
         written.length_m += drive.length_m();
@@ -171,7 +172,7 @@ mod tests {
         };
         let fleet = scenario.fleet(Seed(4));
         let folder = tempfile::tempdir().unwrap();
-        let written = write_fleet(folder.path(), &fleet).unwrap();
+        let written = write_fleet(folder.path(), &fleet, 0..fleet.scenario().drives).unwrap();
         assert_eq!(written.drives, 2);
         let read = Drives::list(folder.path(), &[]).unwrap();
         for (read, drive) in read.iter().zip(fleet.drives()) {

@@ -159,12 +159,14 @@ export class Bar {
   }
 }
 
-/** A time of the day, with the day where it is not today. */
+/** A time of the day, with the day where it is not today, and the year where it is not this one. */
 export function clock(ms) {
   const date = new Date(ms);
-  const today = new Date().toDateString() === date.toDateString();
+  const now = new Date();
   const time = date.toLocaleTimeString("en-GB");
-  return today ? time : `${date.toLocaleDateString("en-GB", { day: "numeric", month: "short" })} ${time}`;
+  if (now.toDateString() === date.toDateString()) return time;
+  const year = now.getFullYear() === date.getFullYear() ? undefined : "numeric";
+  return `${date.toLocaleDateString("en-GB", { day: "numeric", month: "short", year })} ${time}`;
 }
 
 /** A time since the start, minutes and seconds. */

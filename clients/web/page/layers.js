@@ -58,7 +58,11 @@ function measureLayers(by, view, shown) {
 
 function cellLayers(colours, shown) {
   const cells = { source: "cells", maxzoom: TILES_FROM + 0.5, ...(shown ? { filter: shown } : {}) };
-  const fading = ["interpolate", ["linear"], ["zoom"], TILES_FROM - 0.7, 0.8, TILES_FROM, 0.12, TILES_FROM + 0.5, 0];
+  const share = ["interpolate", ["linear"], ["get", "line_km"], 0, 0.15, 10, 0.45, 60, 1];
+  const fading = [
+    "interpolate", ["linear"], ["zoom"],
+    TILES_FROM - 0.7, ["*", 0.8, share], TILES_FROM, ["*", 0.12, share], TILES_FROM + 0.5, 0,
+  ];
   return [
     { id: "cells", type: "fill", ...cells, paint: { "fill-color": colours.ribbon, "fill-opacity": fading } },
     { id: "cells-edge", type: "line", ...cells, paint: { "line-color": colours.ground, "line-width": 1, "line-opacity": fading } },

@@ -107,7 +107,7 @@ export function roadLayers({ prefix = "", source, sourceLayer, shown, latitude, 
   const road = ["interpolate", ["linear"], ["zoom"], RIBBON_ZOOM, colours.ribbon, PAINT_ZOOM, colours.asphalt];
   return [
     layer("verge", { minzoom: RIBBON_ZOOM, paint: { "line-color": colours.verge, "line-width": wide(7, 8) } }),
-    layer("asphalt", { paint: { "line-color": road, "line-width": wide(4.8, 1.6) } }),
+    layer("asphalt", { paint: { "line-color": road, "line-width": wide(4.8, 2.2) } }),
   ];
 }
 

@@ -178,9 +178,10 @@ function typicalSigma(cells) {
   return known.find(({ line_km }) => (passed += line_km) >= half)?.median_lateral_sigma_m ?? NaN;
 }
 
-function cellSquare({ bbox: [west, south, east, north] }) {
+/** A cell as it is seen from afar: the more lines it has, the stronger. */
+function cellSquare({ bbox: [west, south, east, north], line_km }) {
   const ring = [[west, south], [east, south], [east, north], [west, north], [west, south]];
-  return { type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: [ring] } };
+  return { type: "Feature", properties: { line_km }, geometry: { type: "Polygon", coordinates: [ring] } };
 }
 
 function chooseLayer(id) {

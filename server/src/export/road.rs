@@ -29,7 +29,7 @@ const SHORTEST_END_M: f64 = 4.0;
 /// Least share of a lane's width that it must have in common with the one that it goes on in.
 const LEAST_OVERLAP: f64 = 0.5;
 /// Lines that are less likely there bound no lane.
-const LEAST_EXISTENCE: f64 = 0.3;
+const LEAST_EXISTENCE: f64 = 0.6;
 
 /// Which way a lane is driven, seen along its road's reference line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

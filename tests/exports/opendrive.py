@@ -96,12 +96,12 @@ def sampled(path):
         tree = shapely.STRtree([shapely.LineString(line) for line in served])
         worst = 0.0
         for line in references:
-            queries = shapely.points(line[:, :2])
-            (_, nearest), distances = tree.query_nearest(queries, return_distance=True, all_matches=False)
-            for point, index, distance in zip(line, nearest, distances):
-                if distance < 0.02:
-                    on = tree.geometries[index]
-                    worst = max(worst, abs(on.interpolate(on.project(shapely.Point(point[:2]))).z - point[2]))
+            for point in line:
+                here = shapely.Point(point[:2])
+                # Of lines that cross here, the one at this height.
+                near = [tree.geometries[index] for index in tree.query(here, "dwithin", 0.02)]
+                errors = [abs(on.interpolate(on.project(here)).z - point[2]) for on in near]
+                worst = max(worst, min(errors, default=0.0))
         return worst
 
     return plane, references, borders, height_errors

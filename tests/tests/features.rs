@@ -143,6 +143,41 @@ async fn a_walk_through_a_state_of_which_a_drive_was_deleted_is_over() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_pages_of_a_walk_through_the_drives_are_one_state_though_a_drive_goes_on_meanwhile() {
+    let drives = along_a_road(27, 2, 200.0, false);
+    let service = Service::of(&drives[..1]).await;
+    drives[1].upload(&service.server.url(), 60, false).await;
+    settled(&service.server).await;
+    let url = service.items("drives", "limit=2");
+    let next = link(&json(&url).await, "next").expect("there is more than a page");
+    let rest = walked(&next).await;
+    service.drive(&drives[1]).await;
+    let goes_on = async {
+        let mut ticks = tokio::time::interval(std::time::Duration::from_millis(50));
+        while walked(&service.items("drives", "")).await.iter().rev().take(rest.len()).rev().eq(&rest) {
+            ticks.tick().await;
+        }
+    };
+    tokio::time::timeout(std::time::Duration::from_secs(30), goes_on).await.expect("the drive goes on");
+    assert_eq!(walked(&next).await, rest);
+    let mut admin = AdminServiceClient::connect(service.server.url()).await.unwrap();
+    let vehicle_id = drives[1].start.vehicle_id.clone();
+    let request = v1::ForgetRequest { fleet_id: FLEET.to_owned(), vehicle_id, drive_id: None };
+    admin.forget(request).await.unwrap();
+    let mut page = Some(next);
+    while let Some(address) = page {
+        let answer = get(&address).await;
+        if answer.status() == StatusCode::GONE {
+            let problem: Value = answer.json().await.unwrap();
+            assert_eq!(problem["alternate"], url);
+            return;
+        }
+        page = link(&answer.json().await.unwrap(), "next");
+    }
+    panic!("a walk through the state of a deleted drive is over");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn an_unchanged_page_is_answered_304_and_one_that_changed_is_not() {
     let drives = along_a_road(23, 2, 120.0, false);
     let service = Service::of(&drives[..1]).await;

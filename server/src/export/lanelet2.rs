@@ -56,6 +56,8 @@ struct Drawing {
     ways: BTreeMap<WayKey, Vec<NodeKey>>,
     lanelets: Vec<Lanelet>,
     crossings: Vec<Crossing>,
+    /// Nodes in whose place others are.
+    merged: BTreeMap<NodeKey, NodeKey>,
 }
 
 struct Lanelet {
@@ -71,6 +73,7 @@ pub fn write(map: &MapLines, options: LaneOptions, out: &mut dyn Write) -> Resul
     let roads = roads(map, options);
     let mut drawing = draw(map, &roads);
     cross(map, &roads, &joints(map, &roads), &mut drawing);
+    drawing.forget_points();
     let mut file = File {
         map,
         roads: &roads,
@@ -119,9 +122,7 @@ fn draw(map: &MapLines, roads: &[Road]) -> Drawing {
             keys.reverse();
         }
     }
-    drawing.ways.retain(|_, keys| keys.len() > 1);
-    let ways = &drawing.ways;
-    drawing.lanelets.retain(|lanelet| ways.contains_key(&lanelet.left) && ways.contains_key(&lanelet.right));
+    drawing.forget_points();
     drawing
 }
 
@@ -202,6 +203,9 @@ impl Drawing {
         // A ring's last node is its first.
         let parameter = if line.closed && parameter >= line.end() - 1e-9 { 0.0 } else { parameter };
         let key = (index, (parameter * 1e3).round() as i64);
+        if let Some(other) = self.merged.get(&key) {
+            return *other;
+        }
         self.nodes.entry(key).or_insert(parameter);
         key
     }
@@ -215,7 +219,16 @@ impl Drawing {
             keys.iter_mut().filter(|key| **key == gone).for_each(|key| *key = kept);
             keys.dedup();
         }
+        self.merged.values_mut().filter(|key| **key == gone).for_each(|key| *key = kept);
+        self.merged.insert(gone, kept);
         self.nodes.remove(&gone);
+    }
+
+    /// Leaves out line strings that are none, and the lanelets that they would bound.
+    fn forget_points(&mut self) {
+        self.ways.retain(|_, keys| keys.len() > 1);
+        let ways = &self.ways;
+        self.lanelets.retain(|lanelet| ways.contains_key(&lanelet.left) && ways.contains_key(&lanelet.right));
     }
 }
 

@@ -8,7 +8,7 @@ use std::{
     io::{self, Write},
 };
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use quick_xml::Writer;
 
 use super::{
@@ -19,6 +19,7 @@ use super::{
 use crate::export::{
     TrafficSide,
     junction::{Connection, Joints, LaneEnd, RoadEnd, turn},
+    road::{Border, abreast},
 };
 
 /// Where every road and every lane leads on.
@@ -177,19 +178,29 @@ pub(super) fn write_connecting_roads<W: Write>(
     Ok(())
 }
 
-/// Where a way leaves or enters a road: its border on the side of lane 0, at the height of that road's reference line; and the
-/// width of the lane, metres.
+/// Where a way leaves or enters a road: its border on the side of lane 0, straight across from the end of that road's reference
+/// line and at its height; and the width of the lane, metres.
 fn border(end: &LaneEnd, roads: &[DrawnRoad<'_>], keeps_right: bool) -> (Point3<f64>, f64) {
-    let road = &roads[end.at.road];
-    let geometries = &road.geometries;
-    let height_m = if end.at.is_last {
-        geometries.last().map(|last| last.cubic.point(1.0).z)
+    let DrawnRoad { map, road, .. } = &roads[end.at.road];
+    let reference = &map.lines[road.line];
+    let sections = &road.sections;
+    let (section, parameter) = if end.at.is_last {
+        let last = &sections[sections.len() - 1];
+        (last, last.to)
     } else {
-        geometries.first().map(|first| first.cubic.point(0.0).z)
+        (&sections[0], sections[0].from)
     };
-    let inner = if keeps_right { end.left } else { end.right };
-    let width_m = (end.left - end.right).xy().norm();
-    (Point3::new(inner.x, inner.y, height_m.unwrap_or(inner.z)), width_m)
+    let (origin, tangent) = (reference.point(parameter), reference.tangent(parameter));
+    let left_m = |border: &Border| {
+        let near = if end.at.is_last { border.to } else { border.from };
+        if border.line == road.line { 0.0 } else { abreast(&map.lines[border.line], &origin, &tangent, near).1 }
+    };
+    let (left_m, right_m) = (left_m(&section.borders[end.gap]), left_m(&section.borders[end.gap + 1]));
+    // Of the reference's left and right the one that the driver has on the side of lane 0.
+    let is_along = end.leaves == end.at.is_last;
+    let inner_m = if is_along == keeps_right { left_m } else { right_m };
+    let place = origin + Vector3::new(-tangent.y, tangent.x, 0.0) * inner_m;
+    (place, left_m - right_m)
 }
 
 fn write_way<W: Write>(writer: &mut Writer<W>, junction: usize, way: &Way, roads: &[DrawnRoad<'_>]) -> io::Result<()> {

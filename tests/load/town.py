@@ -1,7 +1,8 @@
 """What there is to ask of a town's server: python town.py URL settled|kept|anew.
 
 `settled` fails until all that drives said is in the map. `kept` prints the addresses of some hundred tiles of zoom 14 to 18,
-`anew` those of every tile of zoom 16 to 20 that has lines, in a random order that is always the same.
+`anew` those of every tile of zoom 16 to 20 that has lines, in a random order that is always the same; it asks for one coarse tile
+of each cell, so that cells are read from the store before tiles are counted.
 """
 
 import json
@@ -28,6 +29,8 @@ def main(url, what):
         sys.exit(0 if cells["settled"] else 1)
     places = []
     for cell in cells["cells"]:
+        if what == "anew":
+            urllib.request.urlopen(f"{url}/tiles/lanes/{cell['id'].replace('-', '/')}").close()
         for feature in get(f"{url}/cells/{cell['id']}/lanes.geojson")["features"]:
             coordinates = feature["geometry"]["coordinates"]
             places += coordinates if feature["geometry"]["type"] == "LineString" else sum(coordinates, [])

@@ -5,11 +5,11 @@
 //!
 //! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
 //! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
-//!    shifts, which must be unique to be believed.
+//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart).
 //! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
 //!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
-//! 5. [`base`]: the oldest drives are folded, so that a place costs no more the more often it is driven.
+//! 5. [`base`]: where drives crowd, the oldest are folded (`crowding`), so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
 //!    (`persistence`, `moved`), and the most likely history of each stretch (`history`).
 //! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness; where
@@ -53,12 +53,14 @@
 
 pub mod alignment;
 pub mod base;
+mod bridging;
 pub mod cell;
 mod chain;
 pub mod change;
 mod continuity;
 pub mod contribution;
 pub mod correction;
+mod crowding;
 pub mod fusion;
 mod georeferenced;
 mod growth;
@@ -75,13 +77,14 @@ mod receivers;
 mod shown;
 mod sparse;
 pub mod trace;
+mod ways;
 
 pub use base::Base;
 pub use cell::CellId;
 pub use change::{ChangeKind, MapChange};
 pub use contribution::{Contribution, DriveId, TrajectoryPoint};
 pub use correction::Correction;
-pub use fusion::{FusedDrive, FusedMap, by_seniority, fold, fuse, fuse_onto, split_to_fold};
+pub use fusion::{FusedDrive, FusedMap, are_enough_apart, by_seniority, fold, fuse, fuse_onto, split_to_fold};
 pub use line::{FusedLane, FusedLaneId, FusedPoint};
 pub use params::FleetParams;
 pub use trace::Trace;

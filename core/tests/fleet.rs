@@ -6,11 +6,12 @@ use lanemap_core::{
     Category,
     fleet::{Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto},
 };
+use nalgebra::Vector2;
 use proptest::prelude::*;
-use roads::{Road, Survey, anchor};
+use roads::{Road, Survey, anchor, stretch, with_bias};
 
 /// Distances of every fused knot from the nearest true line, across, after a shift of the whole map.
-fn misfits_m(map: &FusedMap, road: &Road, shift: nalgebra::Vector2<f64>) -> Vec<f64> {
+fn misfits_m(map: &FusedMap, road: &Road, shift: Vector2<f64>) -> Vec<f64> {
     let points = map.lanes.iter().flat_map(|lane| &lane.points);
     let mut misfits: Vec<f64> = points
         .map(|point| {
@@ -28,13 +29,12 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 }
 
 /// The shift that lays the map best on the truth, by a search.
-fn best_shift(map: &FusedMap, road: &Road) -> nalgebra::Vector2<f64> {
-    let mut best = nalgebra::Vector2::zeros();
+fn best_shift(map: &FusedMap, road: &Road) -> Vector2<f64> {
+    let mut best = Vector2::zeros();
     let mut step = 0.5;
-    let cost =
-        |shift: nalgebra::Vector2<f64>| misfits_m(map, road, shift).iter().map(|misfit| misfit.min(1.0)).sum::<f64>();
+    let cost = |shift: Vector2<f64>| misfits_m(map, road, shift).iter().map(|misfit| misfit.min(1.0)).sum::<f64>();
     while step > 0.01 {
-        let around = (-3..=3).flat_map(|x| (-3..=3).map(move |y| nalgebra::Vector2::new(f64::from(x), f64::from(y))));
+        let around = (-3..=3).flat_map(|x| (-3..=3).map(move |y| Vector2::new(f64::from(x), f64::from(y))));
         let next = around.map(|offset| best + offset * step).min_by(|a, b| cost(*a).total_cmp(&cost(*b)));
         best = next.unwrap_or(best);
         step *= 0.5;
@@ -118,6 +118,32 @@ fn a_map_of_folded_and_younger_drives_is_no_worse_than_one_of_the_younger_alone(
     };
     let (younger, all) = (p95(&drives[16..]), p95(&drives));
     assert!(all <= younger, "{all} m with the folded, {younger} m without");
+}
+
+#[test]
+fn the_first_drive_from_one_part_of_the_map_to_another_joins_them_though_their_receivers_are_metres_apart() {
+    let lines = [5.3, 1.8, -1.7, -5.2].map(|left_m| (left_m, Category::WhiteDashed));
+    let road = Road { radius_m: 2_000.0, lines: lines.to_vec(), ..Road::bend(700.0) };
+    let drives = Survey { bias_sigma_m: 0.0, ..Survey::of(&road, 8) }.drives(5);
+    // A lane apart, across the road: what either says of its part is as likely a lane over on the other.
+    let across = |station_m: f64| road.place(station_m, 1.0) - road.place(station_m, 0.0);
+    let mut contributions = vec![
+        with_bias(stretch(&drives[0], 0.0, 480.0), 1.75 * across(240.0)),
+        with_bias(stretch(&drives[1], 550.0, 700.0), -1.75 * across(625.0)),
+    ];
+    let whole = drives[2..].iter().map(|drive| with_bias(drive.clone(), 1.75 * across(240.0)));
+    contributions.extend(whole);
+    let map = fused(&contributions);
+    assert!(map.drives.iter().all(|drive| drive.correction.is_some()));
+    assert_eq!(map.lanes.len(), road.lines.len());
+    let misfits = misfits_m(&map, &road, best_shift(&map, &road));
+    assert!(quantile(&misfits, 0.95) <= 0.2, "{}", quantile(&misfits, 0.95));
+    let points = map.lanes.iter().flat_map(|lane| &lane.points);
+    let drives_on_other_part: Vec<u32> = points
+        .filter(|point| (575.0..675.0).contains(&road.locate(point.position.coords.xy()).0))
+        .map(|point| point.drives)
+        .collect();
+    assert!(drives_on_other_part.iter().all(|drives| *drives == 4), "{drives_on_other_part:?}");
 }
 
 #[test]

@@ -12,6 +12,7 @@ use super::{
     fusion::Fusion,
     line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
     prepared::{DriftSigma, Restraints, SharedFix, normal_of},
+    ways::Ways,
 };
 
 /// What the lines of a base are off by together, over tens of metres: the alignment that they were folded with is final,
@@ -25,6 +26,8 @@ pub struct Base {
     /// Sum of what the drives' receivers say of where it lies, horizontally and in height, 1/m^2.
     gnss_information: [f64; 2],
     lines: Vec<BaseLine>,
+    /// Where its drives went.
+    ways: Ways,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -76,6 +79,11 @@ impl Base {
         }
         lines.index();
         lines
+    }
+
+    /// Where its drives went.
+    pub(super) fn ways(&self) -> &Ways {
+        &self.ways
     }
 
     /// What holds it where it is: fixes at the corners of its lines.
@@ -130,7 +138,11 @@ impl Fusion<'_> {
                 knots: knots.collect(),
             });
         }
-        let mut base = Base { drives: before.drives, gnss_information: before.gnss_information, lines };
+        let mut ways = before.ways.clone();
+        for (drive, _, pass) in self.passes() {
+            ways.add(pass.way, &self.corrections[drive]);
+        }
+        let mut base = Base { drives: before.drives, gnss_information: before.gnss_information, lines, ways };
         for (drive, _) in self.drives.iter().zip(&self.placed).filter(|(_, placed)| **placed) {
             base.drives += 1;
             for (sum, sigma_m) in base.gnss_information.iter_mut().zip(drive.restraints.bias_sigma_m) {

@@ -3,7 +3,7 @@
 //! Drives are taken in the order of their starts. Each is laid on the lines so far and adds to them. Then all
 //! corrections are solved together, and the lines are made again from them, a few times over.
 //!
-//! So that a place that thousands of drives pass costs no more than one that a few do, the oldest are folded, so many at a
+//! So that a place that thousands of drives pass costs no more than one that a few do, the oldest are folded, a crowd at a
 //! time, into a [`Base`]: lines that stay as they are, with the information of all of them, as one more drive that may
 //! still be shifted as a whole. Which drives are folded depends on their order of seniority alone, so that the
 //! map is the same function of the set of contributions.
@@ -15,18 +15,20 @@ use serde::{Deserialize, Serialize};
 use super::{
     alignment::{RobustScales, Sighting, Target, align},
     base::Base,
+    bridging::{Parts, Placement},
     change::MapChange,
     continuity::run_on,
     contribution::{Contribution, DriveId},
     correction::Correction,
+    crowding::first_crowd,
     georeferenced::UNBOUNDED_M,
     growth::{Growing, Pieces},
     line::{FusedLane, Lines},
     matching::match_lanes,
     params::FleetParams,
-    placement::{Placement, place},
     prepared::{COARSE_STRIDE, PreparedDrive, PreparedPass, Restraints, normal_of},
     receivers::learned_shape_share,
+    ways::Ways,
 };
 use crate::geometry::georeference::Anchor;
 
@@ -60,7 +62,7 @@ pub fn fuse(contributions: &[Contribution], anchor: &Anchor, params: &FleetParam
     let ordered = by_seniority(contributions);
     let mut base = Base::default();
     let mut rest = ordered.as_slice();
-    while let Some((oldest, younger)) = split_to_fold(rest, params) {
+    while let Some((oldest, younger)) = split_to_fold(rest, anchor, params) {
         base = fold(&base, oldest, anchor, params);
         rest = younger;
     }
@@ -78,13 +80,22 @@ pub fn by_seniority(contributions: &[Contribution]) -> Vec<&Contribution> {
     ordered
 }
 
-/// The drives that are folded next, and the others; `None` where none is to be.
+/// The drives that are folded next, and the others; `None` where none is to be. Both are crowds (`crowding`).
 #[must_use]
 pub fn split_to_fold<'a, 'c>(
     ordered: &'a [&'c Contribution],
+    anchor: &Anchor,
     params: &FleetParams,
 ) -> Option<(&'a [&'c Contribution], &'a [&'c Contribution])> {
-    (ordered.len() >= params.drives_apart + params.drives_per_fold).then(|| ordered.split_at(params.drives_per_fold))
+    let oldest = first_crowd(ordered, anchor, params.drives_per_fold)?;
+    let (oldest, younger) = ordered.split_at(oldest);
+    are_enough_apart(younger, anchor, params).then_some((oldest, younger))
+}
+
+/// Whether so many drives are kept apart that older ones may be folded.
+#[must_use]
+pub fn are_enough_apart(ordered: &[&Contribution], anchor: &Anchor, params: &FleetParams) -> bool {
+    first_crowd(ordered, anchor, params.drives_apart).is_some()
 }
 
 /// Folds the next drives into a base.
@@ -117,6 +128,12 @@ pub(super) struct Fusion<'a> {
     restraints: Vec<Restraints>,
     pub(super) placed: Vec<bool>,
     pub(super) lines: Lines,
+    /// Where drives went that are laid on the lines.
+    pub(super) ways: Ways,
+    /// Which those are.
+    pub(super) is_laid: Vec<bool>,
+    /// Which of them are joined by common roads.
+    pub(super) parts: Parts,
 }
 
 /// Distance between two stations of a line in the alignment, knots.
@@ -133,7 +150,14 @@ impl<'a> Fusion<'a> {
         let lines = base.lines(drives.len(), &Correction::identity());
         let restraints = drives.iter().map(|drive| drive.restraints.clone());
         let restraints = restraints.chain([base.restraints()]).collect();
-        Self { drives, params, base, corrections, restraints, placed, lines }
+        let is_laid = vec![false; drives.len()];
+        let parts = Parts::new(drives.len(), base.drives());
+        Self { drives, params, base, corrections, restraints, placed, lines, ways: base.ways().clone(), is_laid, parts }
+    }
+
+    /// Where folded drives went.
+    pub(super) fn base_ways(&self) -> &'a Ways {
+        self.base.ways()
     }
 
     fn run(&mut self) {
@@ -168,22 +192,23 @@ impl<'a> Fusion<'a> {
         let mut later = Vec::new();
         let mut first_pass = 0;
         for drive in 0..self.drives.len() {
-            if self.placed[drive] && !self.place_drive(drive, first_pass, &mut pieces) {
+            if self.placed[drive] && !self.place_drive(drive, first_pass, &mut pieces, false) {
                 later.push((drive, first_pass));
             }
             first_pass += self.drives[drive].passes.len();
         }
         for (drive, first_pass) in later {
-            self.placed[drive] = self.place_drive(drive, first_pass, &mut pieces);
+            self.placed[drive] = self.place_drive(drive, first_pass, &mut pieces, true);
         }
     }
 
     /// Lays one drive on the lines and adds it to them; whether it was found.
-    fn place_drive(&mut self, drive: usize, first_pass: usize, pieces: &mut Pieces) -> bool {
+    fn place_drive(&mut self, drive: usize, first_pass: usize, pieces: &mut Pieces, is_last_chance: bool) -> bool {
         let prepared = &self.drives[drive];
         for (index, pass) in prepared.passes.iter().enumerate() {
-            let sigma_m = if index == 0 { self.prior_sigma_m(drive) } else { self.params.gnss_bias_sigma_m };
-            match place(&pass.lanes, drive, &self.corrections[drive], &self.lines, sigma_m, self.params) {
+            let sigma_m =
+                if index == 0 { self.restraints[drive].bias_sigma_m[0] } else { self.params.gnss_bias_sigma_m };
+            match self.lay(drive, pass, sigma_m, is_last_chance) {
                 Placement::Refused if index == 0 => return false,
                 // A later pass that fits nowhere lies where odometry puts it after the one before.
                 Placement::Alone | Placement::Refused => {}
@@ -199,6 +224,8 @@ impl<'a> Fusion<'a> {
                 }
             }
             self.grow(drive, first_pass + index, pass, pieces);
+            self.ways.add(pass.way, &self.corrections[drive]);
+            self.is_laid[drive] = true;
         }
         self.placed[drive] = true;
         true
@@ -218,12 +245,6 @@ impl<'a> Fusion<'a> {
         let correction = &mut self.corrections[drive..=drive];
         let scales = RobustScales { lanes_m: robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
         align(&[&self.restraints[drive]], correction, &sightings, 0, scales);
-    }
-
-    /// Standard deviation of where GNSS puts a drive against the map so far.
-    fn prior_sigma_m(&self, drive: usize) -> f64 {
-        let before = self.placed[..drive].iter().filter(|placed| **placed).count() + self.base.drives();
-        self.restraints[drive].bias_sigma_m[0] * (1.0 + 1.0 / before.max(1) as f64).sqrt()
     }
 
     /// Where lanes of some passes of a drive lie on lines.

@@ -197,6 +197,21 @@ impl Line {
         self.knots.insert(0, knot);
     }
 
+    /// The first drive that its first knot was seen by, as a number among the corrections.
+    pub(super) fn first_drive(&self) -> usize {
+        self.knots.iter().find_map(|knot| knot.witnesses.first()).map_or(0, |witness| witness.drive)
+    }
+
+    /// Moves all of it, with what its witnesses say.
+    pub(super) fn move_by(&mut self, by_m: &Vector3<f64>) {
+        for point in &mut self.points {
+            *point += by_m;
+        }
+        for witness in self.knots.iter_mut().flat_map(|knot| &mut knot.witnesses) {
+            witness.shared += by_m;
+        }
+    }
+
     /// Takes a witness' belief over the categories, for so many metres.
     pub(super) fn vote(&mut self, posterior: &[f64], length_m: f64) {
         for (sum, own) in self.category_votes.iter_mut().zip(posterior) {

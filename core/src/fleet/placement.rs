@@ -6,16 +6,21 @@
 //! `log L_w(d) = share * sum_samples log max(e, max_lines a exp(-(n . d - x)^2 / 2 s^2))`,
 //!
 //! where `x` is how far to the left the sample would have to move to lie on the line, `n` that direction, and `a` how well the
-//! categories agree. The most probable sequence of shifts over the windows (Viterbi) allows for the drift of odometry
+//! categories agree. Where drives went that the sample meets, `L` is lower: [`ways`](super::ways) are not shared by those that
+//! meet. The most probable sequence of shifts over the windows (Viterbi) allows for the drift of odometry
 //! between them and for the prior of GNSS. It is believed only if it explains most of what is there, and clearly better
 //! than the same sequence shifted across the road by about a lane.
 //!
 //! Not guaranteed: a road of equal lines without an edge in view looks the same a lane further; there the prior decides, and
 //! where it does not, the drive is kept apart. On a straight road shifts along it are left to the prior.
 
-use std::f64::consts::PI;
+mod meeting;
+mod search;
 
 use nalgebra::Vector2;
+
+use meeting::{Meeting, meetings};
+pub(super) use search::Shifts;
 
 use super::{
     alignment::{Sighting, Target},
@@ -23,24 +28,34 @@ use super::{
     line::Lines,
     matching::offset_from,
     params::FleetParams,
-    prepared::{LaneSample, PreparedLane, count_of, normal_of},
+    prepared::{LaneSample, PreparedLane, PreparedPass, count_of, normal_of},
+    ways::Ways,
 };
 
-/// What became of the search.
-#[derive(Clone, Debug)]
-pub(super) enum Placement {
-    /// There is no line where the drive went: GNSS or odometry alone places it.
-    Alone,
-    /// It lies here, by these sightings of lines.
-    Found(Vec<Sighting>),
-    /// It fits nowhere, or at more places than one.
-    Refused,
+/// What is known of where a pass lies on the map before its lanes are looked at.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Prior {
+    /// East and north, metres.
+    pub(super) shift_m: Vector2<f64>,
+    /// Standard deviation of each, metres.
+    pub(super) sigma_m: f64,
+}
+
+impl Prior {
+    /// How far shifts are searched, metres.
+    pub(super) fn reach_m(&self, params: &FleetParams) -> f64 {
+        (params.search_sigmas * self.sigma_m + self.shift_m.norm()).max(2.0)
+    }
+}
+
+/// Lines and ways of others beside a pass.
+pub(super) struct Surroundings<'a> {
+    votes: Vec<Vote<'a>>,
+    meetings: Vec<Meeting>,
 }
 
 /// Way of a window, metres.
 const WINDOW_M: f64 = 60.0;
-/// Step of the search, metres.
-const STEP_M: f64 = 0.5;
 /// Scatter of a sample about its line during the search, metres.
 const SCATTER_M: f64 = 0.45;
 /// Likelihood of a sample that lies beside a line where no other can be.
@@ -52,19 +67,16 @@ const BESIDE_M: f64 = 2.2;
 /// Distance at which a sample still lies on a line, metres.
 const ON_LINE_M: f64 = 0.8;
 /// Samples near lines below which there is nothing to be placed on.
-const LEAST_SAMPLES: usize = 8;
-/// Shift across the road that counts as another place, metres.
-const ANOTHER_PLACE_M: f64 = 1.4;
+pub(super) const LEAST_SAMPLES: usize = 8;
 /// Least logarithm of how much more probable the place is than any other.
 const LEAST_MARGIN: f64 = 2.0;
 /// Least share of samples that must lie on a line.
 const LEAST_EXPLAINED: f64 = 0.55;
 /// Every how many samples of a lane one votes.
 const STRIDE: usize = 4;
-/// Largest search, steps to each side.
-const MOST_STEPS: usize = 40;
 
 /// One sample with the lines beside it.
+#[derive(Clone)]
 struct Vote<'a> {
     sample: &'a LaneSample,
     window: usize,
@@ -74,68 +86,78 @@ struct Vote<'a> {
 }
 
 /// A line beside a sample.
+#[derive(Clone, Copy)]
 struct Beside {
     line: usize,
     parameter: f64,
     /// Move to the left that would lay the sample on the line, metres.
     move_m: f64,
+    /// How far above the line the sample lies, metres.
+    above_m: f64,
     agreement: f64,
 }
 
-/// The shifts that are searched: a square about none.
-#[derive(Clone, Copy)]
-struct Square {
-    /// Steps to each side.
-    side: usize,
-}
-
-/// Log-likelihoods of one window, by shift.
-type Likelihood = Vec<f64>;
-
-/// Lays lanes of a drive, whose number in the sightings is `drive`, on the lines.
-pub(super) fn place(
-    lanes: &[PreparedLane<'_>],
-    drive: usize,
-    correction: &Correction,
-    lines: &Lines,
-    prior_sigma_m: f64,
-    params: &FleetParams,
-) -> Placement {
-    let reach_m = (params.search_sigmas * prior_sigma_m).max(2.0);
-    let square = Square { side: count_of((reach_m / STEP_M).ceil()).min(MOST_STEPS) };
-    let votes = votes(lanes, correction, lines, reach_m);
-    if votes.len() < LEAST_SAMPLES {
-        return Placement::Alone;
-    }
-    let windows = likelihoods(&votes, square, prior_sigma_m, params);
-    let path = most_probable(&windows, square, params);
-    let shift_of = |vote: &Vote<'_>| vote.normal.dot(&square.shift(path[vote.window]));
-    if explained(&votes, shift_of) < LEAST_EXPLAINED || margin(&windows, &path, &votes, square) < LEAST_MARGIN {
-        return Placement::Refused;
-    }
-    Placement::Found(sightings(&votes, shift_of, drive, lines))
-}
-
-impl Square {
-    fn width(self) -> usize {
-        2 * self.side + 1
+impl<'a> Surroundings<'a> {
+    /// What lies beside a pass within a distance.
+    pub(super) fn new(
+        pass: &'a PreparedPass<'_>,
+        correction: &Correction,
+        lines: &Lines,
+        ways: &Ways,
+        reach_m: f64,
+    ) -> Self {
+        let votes = votes(&pass.lanes, correction, lines, reach_m);
+        let meetings = if votes.is_empty() { Vec::new() } else { meetings(pass, correction, ways, reach_m) };
+        Self { votes, meetings }
     }
 
-    fn count(self) -> usize {
-        self.width() * self.width()
+    /// Number of samples beside a line.
+    pub(super) fn samples(&self) -> usize {
+        self.votes.len()
     }
 
-    /// East and north of a state, metres.
-    fn shift(self, state: usize) -> Vector2<f64> {
-        let at = |step: usize| (step as f64 - self.side as f64) * STEP_M;
-        Vector2::new(at(state % self.width()), at(state / self.width()))
+    /// Every line beside a sample, once for each.
+    pub(super) fn lines(&self) -> impl Iterator<Item = usize> {
+        self.votes.iter().flat_map(|vote| vote.lines.iter().map(|beside| beside.line))
     }
 
-    /// The state so many steps to the east and north.
-    fn moved(self, state: usize, east: isize, north: isize) -> Option<usize> {
-        let x = (state % self.width()).checked_add_signed(east).filter(|x| *x < self.width())?;
-        let y = (state / self.width()).checked_add_signed(north).filter(|y| *y < self.width())?;
-        Some(y * self.width() + x)
+    /// The same with some of the lines.
+    pub(super) fn with_lines(&self, is_one: impl Fn(usize) -> bool) -> Self {
+        let votes = self.votes.iter().filter_map(|vote| {
+            let lines: Vec<Beside> = vote.lines.iter().filter(|beside| is_one(beside.line)).copied().collect();
+            (!lines.is_empty()).then(|| Vote { lines, ..vote.clone() })
+        });
+        Self { votes: votes.collect(), meetings: self.meetings.clone() }
+    }
+
+    /// The shifts that lay the pass on the lines; `None` where it fits nowhere, or at more places than one.
+    pub(super) fn search(&self, prior: &Prior, params: &FleetParams) -> Option<Shifts> {
+        let found = search::most_probable(&self.votes, &self.meetings, prior, params);
+        let is_believed = explained(&self.votes, |vote| found.shifts.move_of(vote)) >= LEAST_EXPLAINED
+            && found.margin >= LEAST_MARGIN;
+        is_believed.then_some(found.shifts)
+    }
+
+    /// The samples that lie on a line after the shift, with where they should lie.
+    pub(super) fn sightings(&self, shifts: &Shifts, drive: usize, lines: &Lines) -> Vec<Sighting> {
+        sightings(&self.votes, |vote| shifts.move_of(vote), drive, lines)
+    }
+
+    /// How far the lines would have to move, east and north, for the pass to lie on them after other shifts, metres.
+    pub(super) fn move_of_lines(&self, onto_them: &Shifts, instead: &Shifts) -> Vector2<f64> {
+        let moves = self.votes.iter().map(|vote| instead.at(vote.window) - onto_them.at(vote.window));
+        moves.sum::<Vector2<f64>>() / self.votes.len().max(1) as f64
+    }
+
+    /// How far above the lines the pass lies after the shifts, metres: the median.
+    pub(super) fn above_m(&self, shifts: &Shifts) -> f64 {
+        let nearest = self.votes.iter().filter_map(|vote| {
+            let move_m = shifts.move_of(vote);
+            vote.lines.iter().min_by(|a, b| (a.move_m - move_m).abs().total_cmp(&(b.move_m - move_m).abs()))
+        });
+        let mut above: Vec<f64> = nearest.map(|beside| beside.above_m).collect();
+        above.sort_by(f64::total_cmp);
+        above.get(above.len() / 2).copied().unwrap_or(0.0)
     }
 }
 
@@ -152,6 +174,7 @@ fn votes<'a>(lanes: &'a [PreparedLane<'_>], correction: &Correction, lines: &Lin
                     line,
                     parameter,
                     move_m: -across_m * cosine.signum(),
+                    above_m: height_m,
                     agreement: agreement(&lane.lane.category_posterior, lines.lines[line].posterior()),
                 })
             });
@@ -184,126 +207,12 @@ fn misfit_m(vote: &Vote<'_>, move_m: f64) -> f64 {
     vote.lines.iter().map(|beside| (move_m - beside.move_m).abs()).fold(f64::INFINITY, f64::min)
 }
 
-/// Log-likelihood of every shift in every window; of none where a window has no votes.
-fn likelihoods(votes: &[Vote<'_>], square: Square, prior_sigma_m: f64, params: &FleetParams) -> Vec<Likelihood> {
-    /// Step of the table of a sample's support, metres.
-    const FINE_M: f64 = 0.125;
-    let windows = votes.iter().map(|vote| vote.window).max().unwrap_or(0) + 1;
-    let share = (STRIDE as f64 * params.sample_m / params.lane_correlation_m).min(1.0);
-    let shifts: Vec<Vector2<f64>> = (0..square.count()).map(|state| square.shift(state)).collect();
-    let farthest_m = square.side as f64 * STEP_M * 2.0_f64.sqrt();
-    let half = count_of(farthest_m / FINE_M) + 1;
-    let mut windows: Vec<Likelihood> = vec![Vec::new(); windows];
-    let mut table = vec![0.0; 2 * half + 1];
-    for vote in votes {
-        for (step, value) in table.iter_mut().enumerate() {
-            *value = share * support(vote, (step as f64 - half as f64) * FINE_M);
-        }
-        let window = &mut windows[vote.window];
-        window.resize(square.count(), 0.0);
-        for (sum, shift) in window.iter_mut().zip(&shifts) {
-            *sum += table[count_of(vote.normal.dot(shift) / FINE_M + half as f64 + 0.5)];
-        }
-    }
-    let occupied = windows.iter().filter(|window| !window.is_empty()).count().max(1) as f64;
-    for window in windows.iter_mut().filter(|window| !window.is_empty()) {
-        for (sum, shift) in window.iter_mut().zip(&shifts) {
-            *sum -= 0.5 * shift.norm_squared() / (prior_sigma_m * prior_sigma_m) / occupied;
-        }
-    }
-    windows
-}
-
-/// The most probable state of each window.
-fn most_probable(windows: &[Likelihood], square: Square, params: &FleetParams) -> Vec<usize> {
-    let drift_m2 = params.odometry_sigma_m.powi(2) * WINDOW_M + 0.15_f64.powi(2);
-    // A jump costs the sum of what its two axes cost: the best is found along one, then along the other.
-    let jump = -0.5 * STEP_M * STEP_M / drift_m2;
-    let mut score = vec![0.0; square.count()];
-    let mut from: Vec<Vec<usize>> = Vec::with_capacity(windows.len());
-    let (mut by_east, mut east_from) = (vec![0.0; square.count()], vec![0; square.count()]);
-    for window in windows {
-        best_of_three(&score, 1, square.width(), jump, &mut by_east, &mut east_from);
-        let mut north_from = vec![0; square.count()];
-        best_of_three(&by_east, square.width(), square.count(), jump, &mut score, &mut north_from);
-        for before in &mut north_from {
-            *before = east_from[*before];
-        }
-        for (score, own) in score.iter_mut().zip(window) {
-            *score += own;
-        }
-        from.push(north_from);
-    }
-    let mut state = (0..square.count()).max_by(|a, b| score[*a].total_cmp(&score[*b])).unwrap_or(0);
-    let mut path = vec![0; windows.len()];
-    for window in (0..windows.len()).rev() {
-        path[window] = state;
-        state = from[window][state];
-    }
-    path
-}
-
-/// For each state the best of itself and its two neighbours so many states away, which cost a jump, and which it is. There is
-/// no neighbour over the border of a row of `row` states.
-fn best_of_three(score: &[f64], step: usize, row: usize, jump: f64, best: &mut [f64], of: &mut [usize]) {
-    best.copy_from_slice(score);
-    for (state, of) in of.iter_mut().enumerate() {
-        *of = state;
-    }
-    for start in (0..score.len()).step_by(row) {
-        let row = start..start + row;
-        for state in row.start + step..row.end {
-            if score[state - step] + jump > best[state] {
-                (best[state], of[state]) = (score[state - step] + jump, state - step);
-            }
-        }
-        for state in row.start..row.end - step {
-            if score[state + step] + jump > best[state] {
-                (best[state], of[state]) = (score[state + step] + jump, state + step);
-            }
-        }
-    }
-}
-
 /// Share of the samples that lie on a line, of those that lie on one or where none can be: beside one, within a lane.
 fn explained<'a>(votes: &[Vote<'a>], move_of: impl Fn(&Vote<'a>) -> f64) -> f64 {
     let misfits = votes.iter().map(|vote| misfit_m(vote, move_of(vote)));
     let misfits: Vec<f64> = misfits.filter(|misfit| *misfit <= BESIDE_M).collect();
     let on_line = misfits.iter().filter(|misfit| **misfit <= ON_LINE_M).count();
     on_line as f64 / misfits.len().max(1) as f64
-}
-
-/// Logarithm of how much more probable the path is than the same path shifted across the road to another place.
-fn margin(windows: &[Likelihood], path: &[usize], votes: &[Vote<'_>], square: Square) -> f64 {
-    const DIRECTIONS: usize = 16;
-    let total = |east: isize, north: isize| -> f64 {
-        let at = |(window, state): (&Likelihood, &usize)| match square.moved(*state, east, north) {
-            _ if window.is_empty() => 0.0,
-            Some(state) => window[state],
-            None => window.iter().copied().fold(f64::INFINITY, f64::min),
-        };
-        windows.iter().zip(path).map(at).sum()
-    };
-    let across_m = |shift: Vector2<f64>| {
-        let sum: f64 = votes.iter().map(|vote| vote.normal.dot(&shift).abs()).sum();
-        sum / votes.len() as f64
-    };
-    let mut best_other = f64::NEG_INFINITY;
-    for direction in 0..DIRECTIONS {
-        let (sin, cos) = (2.0 * PI * direction as f64 / DIRECTIONS as f64).sin_cos();
-        for radius in 1..=2 * square.side {
-            let shift = Vector2::new(cos, sin) * (radius as f64 * STEP_M);
-            if across_m(shift) >= ANOTHER_PLACE_M {
-                best_other = best_other.max(total(whole(shift.x / STEP_M), whole(shift.y / STEP_M)));
-            }
-        }
-    }
-    total(0, 0) - best_other
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "the cast saturates, and the square is small")]
-fn whole(value: f64) -> isize {
-    value.round() as isize
 }
 
 /// The samples that lie on a line after the shift, with where they should lie.

@@ -55,6 +55,38 @@ impl Road {
     }
 }
 
+/// What a drive over a road says of a stretch of it.
+pub fn stretch(drive: &Contribution, from_m: f64, to_m: f64) -> Contribution {
+    let is_on_it = |arc_m: f64| arc_m >= from_m && arc_m <= to_m;
+    let trajectory = drive.trajectory.iter().filter(|point| is_on_it(point.arc_m)).cloned();
+    let trajectory: Vec<TrajectoryPoint> = trajectory.collect();
+    let lanes = drive.lanes.iter().map(|lane| {
+        // Control points lie 3 m apart, the first at 12 m.
+        let points = lane.control_points.iter().enumerate();
+        let points = points.filter(|(index, _)| is_on_it(12.0 + 3.0 * *index as f64)).map(|(_, point)| *point);
+        let control_points: Vec<ControlPoint> = points.collect();
+        MapLane {
+            drawn_to: (control_points.len() - 1) as f64,
+            control_points,
+            first_seen: trajectory[0].time,
+            last_seen: trajectory[trajectory.len() - 1].time,
+            ..lane.clone()
+        }
+    });
+    Contribution { lanes: lanes.collect(), trajectory: trajectory.clone(), ..drive.clone() }
+}
+
+/// The same drive with a receiver that is off by so much more, east and north.
+pub fn with_bias(mut drive: Contribution, bias_m: Vector2<f64>) -> Contribution {
+    for fix in drive.trajectory.iter_mut().filter_map(|point| point.fix.as_mut()) {
+        let place = Wgs84 { latitude_deg: fix.latitude_deg, longitude_deg: fix.longitude_deg, height_m: fix.height_m };
+        let moved = anchor().enu_from_wgs84(&place) + nalgebra::Vector3::new(bias_m.x, bias_m.y, 0.0);
+        let moved = anchor().wgs84_from_enu(&moved);
+        (fix.latitude_deg, fix.longitude_deg) = (moved.latitude_deg, moved.longitude_deg);
+    }
+    drive
+}
+
 /// How drives are made.
 pub struct Survey<'a> {
     pub road: &'a Road,

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use lanemap_core::fleet::{
-    Base, CellId, Contribution, FleetParams, FusedMap, by_seniority, fold, fuse_onto, split_to_fold,
+    Base, CellId, Contribution, FleetParams, FusedMap, are_enough_apart, by_seniority, fold, fuse_onto, split_to_fold,
 };
 use quick_cache::sync::Cache;
 
@@ -45,14 +45,20 @@ impl Bases {
         let mut ordered: Vec<(ContributionFact, SessionId)> =
             facts.iter().map(|(session, fact)| (*fact, *session)).collect();
         ordered.sort_unstable();
-        let (mut base, mut folded) = self.longest(cell, &ordered, params);
-        let mut contributions = Vec::new();
-        for (_, session) in &ordered[folded..] {
-            contributions.push(read(*session)?.ok_or_else(|| missing(cell))?);
-        }
+        let mut known = self.known(cell, &ordered).into_iter();
+        let (mut base, mut folded, contributions) = loop {
+            let (base, folded) = known.next().unwrap_or_default();
+            let younger = ordered[folded..].iter();
+            let read = younger.map(|(_, session)| read(*session)?.ok_or_else(|| missing(cell)));
+            let contributions = read.collect::<Result<Vec<Contribution>, JournalError>>()?;
+            // A drive that was taken out may have been one of the crowd that let the older ones be folded.
+            if folded == 0 || are_enough_apart(&by_seniority(&contributions), &anchor, params) {
+                break (base, folded, contributions);
+            }
+        };
         let ordered_contributions = by_seniority(&contributions);
         let mut rest = ordered_contributions.as_slice();
-        while let Some((oldest, younger)) = split_to_fold(rest, params) {
+        while let Some((oldest, younger)) = split_to_fold(rest, &anchor, params) {
             base = Arc::new(fold(&base, oldest, &anchor, params));
             folded += oldest.len();
             self.known.insert((cell, print_of(&ordered[..folded])), Arc::clone(&base));
@@ -61,19 +67,10 @@ impl Bases {
         Ok(fuse_onto(&base, rest, &anchor, params))
     }
 
-    /// The base of the most drives that is known, and their number.
-    fn longest(
-        &self,
-        cell: CellId,
-        ordered: &[(ContributionFact, SessionId)],
-        params: &FleetParams,
-    ) -> (Arc<Base>, usize) {
-        let folds = ordered.len().saturating_sub(params.drives_apart) / params.drives_per_fold.max(1);
-        let known = (1..=folds).rev().find_map(|folds| {
-            let folded = folds * params.drives_per_fold;
-            Some((self.known.get(&(cell, print_of(&ordered[..folded])))?, folded))
-        });
-        known.unwrap_or_default()
+    /// The bases that are known, that of the most drives first, with their numbers.
+    fn known(&self, cell: CellId, ordered: &[(ContributionFact, SessionId)]) -> Vec<(Arc<Base>, usize)> {
+        let of = |folded: usize| Some((self.known.get(&(cell, print_of(&ordered[..folded])))?, folded));
+        (1..=ordered.len()).rev().filter_map(of).collect()
     }
 }
 

@@ -1,0 +1,220 @@
+//! The search for the most probable shifts: one per window of the way, on a square of steps.
+
+use std::f64::consts::PI;
+
+use nalgebra::Vector2;
+
+use super::{Prior, STRIDE, Vote, WINDOW_M, meeting::Meeting, support};
+use crate::fleet::{params::FleetParams, prepared::count_of};
+
+/// Step of the search, metres.
+const STEP_M: f64 = 0.5;
+/// Largest search, steps to each side.
+const MOST_STEPS: usize = 40;
+/// Shift across the road that counts as another place, metres.
+const ANOTHER_PLACE_M: f64 = 1.4;
+
+/// The shifts that are searched: a square about none.
+#[derive(Clone, Copy, Debug)]
+struct Square {
+    /// Steps to each side.
+    side: usize,
+}
+
+/// Log-likelihoods of one window, by shift.
+type Likelihood = Vec<f64>;
+
+/// Shifts along the way, one for each window.
+#[derive(Clone, Debug)]
+pub(in crate::fleet) struct Shifts {
+    square: Square,
+    path: Vec<usize>,
+}
+
+/// What a search found.
+pub(super) struct Found {
+    pub(super) shifts: Shifts,
+    /// Logarithm of how much more probable they are than any others.
+    pub(super) margin: f64,
+}
+
+/// The most probable shifts.
+pub(super) fn most_probable(votes: &[Vote<'_>], meetings: &[Meeting], prior: &Prior, params: &FleetParams) -> Found {
+    let square = Square { side: count_of((prior.reach_m(params) / STEP_M).ceil()).min(MOST_STEPS) };
+    let windows = likelihoods(votes, meetings, square, prior, params);
+    let path = most_probable_path(&windows, square, params);
+    let margin = margin(&windows, &path, votes, square);
+    Found { shifts: Shifts { square, path }, margin }
+}
+
+impl Shifts {
+    /// The shift in a window; beyond the last that of the last, metres.
+    pub(in crate::fleet) fn at(&self, window: usize) -> Vector2<f64> {
+        let state = self.path.get(window).or(self.path.last());
+        state.map_or_else(Vector2::zeros, |state| self.square.shift(*state))
+    }
+
+    /// The mean of all, metres.
+    pub(in crate::fleet) fn mean(&self) -> Vector2<f64> {
+        let sum: Vector2<f64> = self.path.iter().map(|state| self.square.shift(*state)).sum();
+        sum / self.path.len().max(1) as f64
+    }
+
+    /// How far to the left a sample is moved, metres.
+    pub(super) fn move_of(&self, vote: &Vote<'_>) -> f64 {
+        vote.normal.dot(&self.at(vote.window))
+    }
+}
+
+impl Square {
+    fn width(self) -> usize {
+        2 * self.side + 1
+    }
+
+    fn count(self) -> usize {
+        self.width() * self.width()
+    }
+
+    /// East and north of a state, metres.
+    fn shift(self, state: usize) -> Vector2<f64> {
+        let at = |step: usize| (step as f64 - self.side as f64) * STEP_M;
+        Vector2::new(at(state % self.width()), at(state / self.width()))
+    }
+
+    /// The state so many steps to the east and north.
+    fn moved(self, state: usize, east: isize, north: isize) -> Option<usize> {
+        let x = (state % self.width()).checked_add_signed(east).filter(|x| *x < self.width())?;
+        let y = (state / self.width()).checked_add_signed(north).filter(|y| *y < self.width())?;
+        Some(y * self.width() + x)
+    }
+}
+
+/// Log-likelihood of every shift in every window; of none where a window has no votes.
+fn likelihoods(
+    votes: &[Vote<'_>],
+    meetings: &[Meeting],
+    square: Square,
+    prior: &Prior,
+    params: &FleetParams,
+) -> Vec<Likelihood> {
+    /// Step of the table of a sample's support, metres.
+    const FINE_M: f64 = 0.125;
+    let windows = votes.iter().map(|vote| vote.window).max().unwrap_or(0) + 1;
+    let share = (STRIDE as f64 * params.sample_m / params.lane_correlation_m).min(1.0);
+    let shifts: Vec<Vector2<f64>> = (0..square.count()).map(|state| square.shift(state)).collect();
+    let farthest_m = square.side as f64 * STEP_M * 2.0_f64.sqrt();
+    let half = count_of(farthest_m / FINE_M) + 1;
+    let mut windows: Vec<Likelihood> = vec![Vec::new(); windows];
+    let mut table = vec![0.0; 2 * half + 1];
+    let mut add = |window: &mut Likelihood, normal: &Vector2<f64>, support: &dyn Fn(f64) -> f64| {
+        for (step, value) in table.iter_mut().enumerate() {
+            *value = support((step as f64 - half as f64) * FINE_M);
+        }
+        for (sum, shift) in window.iter_mut().zip(&shifts) {
+            *sum += table[count_of(normal.dot(shift) / FINE_M + half as f64 + 0.5)];
+        }
+    };
+    for vote in votes {
+        let window = &mut windows[vote.window];
+        window.resize(square.count(), 0.0);
+        add(window, &vote.normal, &|move_m| share * support(vote, move_m));
+    }
+    // Where no line is, nothing is placed.
+    for meeting in meetings {
+        let window = windows.get_mut(count_of(meeting.arc_m / WINDOW_M)).filter(|window| !window.is_empty());
+        if let Some(window) = window {
+            add(window, &meeting.normal, &|move_m| meeting.support(move_m, WINDOW_M));
+        }
+    }
+    let occupied = windows.iter().filter(|window| !window.is_empty()).count().max(1) as f64;
+    for window in windows.iter_mut().filter(|window| !window.is_empty()) {
+        for (sum, shift) in window.iter_mut().zip(&shifts) {
+            *sum -= 0.5 * (shift - prior.shift_m).norm_squared() / (prior.sigma_m * prior.sigma_m) / occupied;
+        }
+    }
+    windows
+}
+
+/// The most probable state of each window.
+fn most_probable_path(windows: &[Likelihood], square: Square, params: &FleetParams) -> Vec<usize> {
+    let drift_m2 = params.odometry_sigma_m.powi(2) * WINDOW_M + 0.15_f64.powi(2);
+    // A jump costs the sum of what its two axes cost: the best is found along one, then along the other.
+    let jump = -0.5 * STEP_M * STEP_M / drift_m2;
+    let mut score = vec![0.0; square.count()];
+    let mut from: Vec<Vec<usize>> = Vec::with_capacity(windows.len());
+    let (mut by_east, mut east_from) = (vec![0.0; square.count()], vec![0; square.count()]);
+    for window in windows {
+        best_of_three(&score, 1, square.width(), jump, &mut by_east, &mut east_from);
+        let mut north_from = vec![0; square.count()];
+        best_of_three(&by_east, square.width(), square.count(), jump, &mut score, &mut north_from);
+        for before in &mut north_from {
+            *before = east_from[*before];
+        }
+        for (score, own) in score.iter_mut().zip(window) {
+            *score += own;
+        }
+        from.push(north_from);
+    }
+    let mut state = (0..square.count()).max_by(|a, b| score[*a].total_cmp(&score[*b])).unwrap_or(0);
+    let mut path = vec![0; windows.len()];
+    for window in (0..windows.len()).rev() {
+        path[window] = state;
+        state = from[window][state];
+    }
+    path
+}
+
+/// For each state the best of itself and its two neighbours so many states away, which cost a jump, and which it is. There is
+/// no neighbour over the border of a row of `row` states.
+fn best_of_three(score: &[f64], step: usize, row: usize, jump: f64, best: &mut [f64], of: &mut [usize]) {
+    best.copy_from_slice(score);
+    for (state, of) in of.iter_mut().enumerate() {
+        *of = state;
+    }
+    for start in (0..score.len()).step_by(row) {
+        let row = start..start + row;
+        for state in row.start + step..row.end {
+            if score[state - step] + jump > best[state] {
+                (best[state], of[state]) = (score[state - step] + jump, state - step);
+            }
+        }
+        for state in row.start..row.end - step {
+            if score[state + step] + jump > best[state] {
+                (best[state], of[state]) = (score[state + step] + jump, state + step);
+            }
+        }
+    }
+}
+
+/// Logarithm of how much more probable the path is than the same path shifted across the road to another place.
+fn margin(windows: &[Likelihood], path: &[usize], votes: &[Vote<'_>], square: Square) -> f64 {
+    const DIRECTIONS: usize = 16;
+    let total = |east: isize, north: isize| -> f64 {
+        let at = |(window, state): (&Likelihood, &usize)| match square.moved(*state, east, north) {
+            _ if window.is_empty() => 0.0,
+            Some(state) => window[state],
+            None => window.iter().copied().fold(f64::INFINITY, f64::min),
+        };
+        windows.iter().zip(path).map(at).sum()
+    };
+    let across_m = |shift: Vector2<f64>| {
+        let sum: f64 = votes.iter().map(|vote| vote.normal.dot(&shift).abs()).sum();
+        sum / votes.len() as f64
+    };
+    let mut best_other = f64::NEG_INFINITY;
+    for direction in 0..DIRECTIONS {
+        let (sin, cos) = (2.0 * PI * direction as f64 / DIRECTIONS as f64).sin_cos();
+        for radius in 1..=2 * square.side {
+            let shift = Vector2::new(cos, sin) * (radius as f64 * STEP_M);
+            if across_m(shift) >= ANOTHER_PLACE_M {
+                best_other = best_other.max(total(whole(shift.x / STEP_M), whole(shift.y / STEP_M)));
+            }
+        }
+    }
+    total(0, 0) - best_other
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "the cast saturates, and the square is small")]
+fn whole(value: f64) -> isize {
+    value.round() as isize
+}

@@ -89,6 +89,9 @@ fn layer<'a>(tile: &'a mvt::Tile, name: &str) -> &'a mvt::Layer {
     tile.layers.iter().find(|layer| layer.name == name).expect("the layer is there")
 }
 
+/// The vertices of a tile by layer and line, in units of its zoom.
+type Drawn = BTreeMap<(String, u64), BTreeSet<[i64; 2]>>;
+
 fn distance(point: &Point2<f64>, line: &[Point2<f64>]) -> f64 {
     let chords = line.windows(2).filter(|pair| pair[0] != pair[1]).map(|pair| {
         let chord = pair[1] - pair[0];
@@ -99,22 +102,25 @@ fn distance(point: &Point2<f64>, line: &[Point2<f64>]) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_vertex_of_a_tile_lies_within_half_a_unit_of_a_spline_and_is_the_same_in_neighbouring_tiles() {
+async fn every_vertex_of_lines_and_dashes_lies_within_half_a_unit_of_a_spline_and_is_the_same_in_neighbouring_tiles() {
     let service = Service::start(21).await;
+    let mut dashes = 0;
     for zoom in [14, 16, 18, 20] {
         let splines = service.splines(zoom);
-        // Where lines are drawn, in units of the zoom: by line, what each tile shows of the square around a vertex.
-        let mut shown: BTreeMap<TileId, BTreeMap<u64, BTreeSet<[i64; 2]>>> = BTreeMap::new();
+        let mut shown: BTreeMap<TileId, Drawn> = BTreeMap::new();
         let tiles = service.tiles(zoom);
         for tile in tiles.iter().take(40) {
             let lines = shown.entry(*tile).or_default();
-            for feature in &layer(&service.vector_tile(*tile).await, "lanes").features {
-                let corner = tile.corner();
-                let vertices = mvt::line_parts(feature).unwrap().into_iter().flatten();
-                lines
-                    .entry(feature.id.unwrap())
-                    .or_default()
-                    .extend(vertices.map(|vertex| [0, 1].map(|axis| vertex[axis] + corner[axis])));
+            let corner = tile.corner();
+            let layers = service.vector_tile(*tile).await.layers;
+            for layer in layers.iter().filter(|layer| ["lanes", "dashes"].contains(&layer.name.as_str())) {
+                for feature in &layer.features {
+                    let vertices = mvt::line_parts(feature).unwrap().into_iter().flatten();
+                    lines
+                        .entry((layer.name.clone(), feature.id.unwrap()))
+                        .or_default()
+                        .extend(vertices.map(|vertex| [0, 1].map(|axis| vertex[axis] + corner[axis])));
+                }
             }
         }
         for vertex in shown.values().flat_map(BTreeMap::values).flatten() {
@@ -140,12 +146,14 @@ async fn every_vertex_of_a_tile_lies_within_half_a_unit_of_a_spline_and_is_the_s
             for (id, vertices) in lines {
                 let here: BTreeSet<_> = vertices.iter().filter(both).collect();
                 let there: BTreeSet<_> = neighbour.get(id).into_iter().flatten().filter(both).collect();
-                assert_eq!(here, there, "line {id} of {tile} at zoom {zoom}");
+                assert_eq!(here, there, "line {id:?} of {tile} at zoom {zoom}");
                 compared += here.len();
+                dashes += if id.0 == "dashes" { here.len() } else { 0 };
             }
         }
         assert!(compared > 0 || tiles.len() < 3, "lines lead over tiles at zoom {zoom}");
     }
+    assert!(dashes > 0, "dashes lie at the borders of tiles");
     service.server.shutdown().await;
 }
 

@@ -21,7 +21,7 @@ use super::{
     chain::ChainEquations,
     correction::Correction,
     prepared::Restraints,
-    sparse::{Equations, NormalEquations},
+    sparse::{Chain, Elimination, Equations, JointEquations},
 };
 
 /// Where a sample should lie along its normal.
@@ -58,9 +58,12 @@ pub(super) struct RobustScales {
     pub(super) fixes_m: f64,
 }
 
-/// Unknowns of a drive's horizontal problem: 3 per knot, then 2 of the bias, 1 of odometry's scale, 1 of its turn.
+/// Unknowns: of each drive those of its knots, then those that they have in common; then the stations.
 struct Layout {
-    first: Vec<usize>,
+    chains: Vec<Chain>,
+    per_knot: usize,
+    common: usize,
+    /// First station.
     stations: usize,
     unknowns: usize,
 }
@@ -68,21 +71,31 @@ struct Layout {
 /// Normal equations in the form that suits the problem.
 enum Solver {
     Chain(ChainEquations),
-    Sparse(NormalEquations),
+    Joint(JointEquations),
+}
+
+/// The orders in which the horizontal problem and that of the heights are eliminated, kept from one alignment of the same drives to the
+/// next.
+#[derive(Debug, Default)]
+pub(super) struct Eliminations {
+    across: Elimination,
+    height: Elimination,
 }
 
 impl Equations for Solver {
     fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
         match self {
             Self::Chain(chain) => chain.add(row, value, weight),
-            Self::Sparse(sparse) => sparse.add(row, value, weight),
+            Self::Joint(joint) => joint.add(row, value, weight),
         }
     }
+}
 
-    fn solve(self) -> Option<Vec<f64>> {
+impl Solver {
+    fn solve(self, elimination: &mut Elimination) -> Option<Vec<f64>> {
         match self {
             Self::Chain(chain) => chain.solve(),
-            Self::Sparse(sparse) => sparse.solve(),
+            Self::Joint(joint) => joint.solve(elimination),
         }
     }
 }
@@ -91,6 +104,16 @@ const GAUSS_NEWTON_STEPS: usize = 2;
 /// Holds what nothing else holds, 1/m^2.
 const WEAK: f64 = 1e-9;
 
+/// Solves for the correction of one drive, whose sightings are of lines that stay where they are.
+pub(super) fn align_one(
+    drive: &Restraints,
+    correction: &mut Correction,
+    sightings: &[Sighting],
+    scales: RobustScales,
+) {
+    align(&[drive], std::slice::from_mut(correction), sightings, 0, scales, &mut Eliminations::default());
+}
+
 /// Solves for the corrections of `drives` (as many corrections), with `stations` stations.
 pub(super) fn align(
     drives: &[&Restraints],
@@ -98,11 +121,12 @@ pub(super) fn align(
     sightings: &[Sighting],
     stations: usize,
     scales: RobustScales,
+    eliminations: &mut Eliminations,
 ) {
     for _ in 0..GAUSS_NEWTON_STEPS {
-        align_horizontally(drives, corrections, sightings, stations, scales);
+        align_horizontally(drives, corrections, sightings, stations, scales, &mut eliminations.across);
     }
-    align_heights(drives, corrections, sightings, stations, scales);
+    align_heights(drives, corrections, sightings, stations, scales, &mut eliminations.height);
 }
 
 /// The weight that Geman and `McClure` give a residual.
@@ -112,24 +136,30 @@ pub(super) fn robust_weight(residual_m: f64, scale_m: f64) -> f64 {
 }
 
 impl Layout {
-    fn new(corrections: &[Correction], per_knot: usize, biases: usize, stations: usize) -> Self {
+    fn new(corrections: &[Correction], per_knot: usize, common: usize, stations: usize) -> Self {
         let mut next = 0;
-        let first = corrections.iter().map(|correction| {
+        let chains = corrections.iter().map(|correction| {
             let first = next;
-            next += correction.knots.len() * per_knot + biases;
-            first
+            next += correction.knots.len() * per_knot + common;
+            Chain { first, knots: correction.knots.len() }
         });
-        let first: Vec<usize> = first.collect();
-        Self { first, stations: next, unknowns: next + stations }
+        let chains: Vec<Chain> = chains.collect();
+        Self { chains, per_knot, common, stations: next, unknowns: next + stations }
     }
 
-    /// No row yet: a chain where there is one drive, whose knots have the last `common` unknowns in common.
-    fn equations(&self, common: usize) -> Solver {
-        if self.first.len() == 1 && self.stations == self.unknowns {
-            Solver::Chain(ChainEquations::new(self.unknowns - common, self.unknowns, WEAK))
+    /// No row yet.
+    fn equations(&self) -> Solver {
+        let stations = self.unknowns - self.stations;
+        if self.chains.len() == 1 && stations == 0 {
+            Solver::Chain(ChainEquations::new(self.unknowns - self.common, self.unknowns, WEAK))
         } else {
-            Solver::Sparse(NormalEquations::new(self.unknowns, WEAK))
+            Solver::Joint(JointEquations::new(&self.chains, self.per_knot, self.common, stations, WEAK))
         }
+    }
+
+    /// First unknown of a drive.
+    fn first(&self, drive: usize) -> usize {
+        self.chains[drive].first
     }
 }
 
@@ -159,11 +189,13 @@ fn align_horizontally(
     sightings: &[Sighting],
     stations: usize,
     scales: RobustScales,
+    elimination: &mut Elimination,
 ) {
+    // In common: 2 of the bias, 1 of odometry's scale, 1 of its turn.
     let layout = Layout::new(corrections, 3, 4, stations);
-    let mut equations = layout.equations(4);
+    let mut equations = layout.equations();
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
-        let first = layout.first[index];
+        let first = layout.first(index);
         add_odometry(&mut equations, first, drive, correction);
         add_fixes(&mut equations, first, drive, correction, scales.fixes_m);
     }
@@ -172,7 +204,7 @@ fn align_horizontally(
     for (sighting, residual) in sightings.iter().zip(residuals) {
         let correction = &corrections[sighting.drive];
         let mut row =
-            row_across(layout.first[sighting.drive], correction, &sighting.map, sighting.arc_m, &sighting.normal);
+            row_across(layout.first(sighting.drive), correction, &sighting.map, sighting.arc_m, &sighting.normal);
         let place = correction.apply(&sighting.map, sighting.arc_m).coords.xy().dot(&sighting.normal);
         let value = match sighting.across {
             Target::Fixed(target) => target - place,
@@ -184,9 +216,9 @@ fn align_horizontally(
         let weight = robust_weight(residual, scales.lanes_m) / sighting.lateral_variance_m2;
         equations.add(&row, value, weight);
     }
-    let Some(step) = equations.solve() else { return };
-    for (correction, first) in corrections.iter_mut().zip(&layout.first) {
-        for (knot, step) in correction.knots.iter_mut().zip(step[*first..].chunks_exact(3)) {
+    let Some(step) = equations.solve(elimination) else { return };
+    for (correction, chain) in corrections.iter_mut().zip(&layout.chains) {
+        for (knot, step) in correction.knots.iter_mut().zip(step[chain.first..].chunks_exact(3)) {
             knot.shared.x += step[0];
             knot.shared.y += step[1];
             knot.yaw_rad += step[2];
@@ -292,11 +324,12 @@ fn align_heights(
     sightings: &[Sighting],
     stations: usize,
     scales: RobustScales,
+    elimination: &mut Elimination,
 ) {
     let layout = Layout::new(corrections, 1, 1, stations);
-    let mut equations = layout.equations(1);
+    let mut equations = layout.equations();
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
-        let first = layout.first[index];
+        let first = layout.first(index);
         for (knot, (pair, step)) in correction.knots.windows(2).zip(&drive.steps).enumerate() {
             let residual = (pair[1].shared.z - pair[0].shared.z) - (pair[1].map.z - pair[0].map.z);
             equations.add(&[(first + knot + 1, 1.0), (first + knot, -1.0)], -residual, 1.0 / step.height_m2);
@@ -307,7 +340,7 @@ fn align_heights(
         sightings.iter().map(|sighting| corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).z).collect();
     let residuals = residuals(&places, sightings.iter().map(|sighting| sighting.height), stations);
     for ((sighting, place), residual) in sightings.iter().zip(&places).zip(residuals) {
-        let mut row = row_of_height(layout.first[sighting.drive], &corrections[sighting.drive], sighting.arc_m);
+        let mut row = row_of_height(layout.first(sighting.drive), &corrections[sighting.drive], sighting.arc_m);
         let value = match sighting.height {
             Target::Fixed(target) => target - place,
             Target::Station(station) => {
@@ -318,9 +351,9 @@ fn align_heights(
         let weight = robust_weight(residual, 2.0 * scales.lanes_m) / sighting.height_variance_m2;
         equations.add(&row, value, weight);
     }
-    let Some(step) = equations.solve() else { return };
-    for (correction, first) in corrections.iter_mut().zip(&layout.first) {
-        for (knot, step) in correction.knots.iter_mut().zip(&step[*first..]) {
+    let Some(step) = equations.solve(elimination) else { return };
+    for (correction, chain) in corrections.iter_mut().zip(&layout.chains) {
+        for (knot, step) in correction.knots.iter_mut().zip(&step[chain.first..]) {
             knot.shared.z += step;
         }
     }

@@ -119,22 +119,9 @@ impl ChainEquations {
             }
         }
     }
-}
 
-impl Equations for ChainEquations {
-    fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
-        for (position, (i, a)) in row.iter().enumerate() {
-            match i.checked_sub(self.chained) {
-                None => self.sides[*i][BORDER] += weight * a * value,
-                Some(common) => self.corner_right[common] += weight * a * value,
-            }
-            for (j, b) in &row[..=position] {
-                self.add_entry(*i.min(j), *i.max(j), weight * a * b);
-            }
-        }
-    }
-
-    fn solve(mut self) -> Option<Vec<f64>> {
+    /// The solution, or `None` where the matrix is not positive definite.
+    pub(super) fn solve(mut self) -> Option<Vec<f64>> {
         let columns: Vec<[f64; SIDES]> = self.sides.clone();
         self.factorise()?;
         self.substitute();
@@ -158,12 +145,26 @@ impl Equations for ChainEquations {
     }
 }
 
+impl Equations for ChainEquations {
+    fn add(&mut self, row: &[(usize, f64)], value: f64, weight: f64) {
+        for (position, (i, a)) in row.iter().enumerate() {
+            match i.checked_sub(self.chained) {
+                None => self.sides[*i][BORDER] += weight * a * value,
+                Some(common) => self.corner_right[common] += weight * a * value,
+            }
+            for (j, b) in &row[..=position] {
+                self.add_entry(*i.min(j), *i.max(j), weight * a * b);
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::fleet::sparse::NormalEquations;
+    use crate::fleet::sparse::{Chain, Elimination, JointEquations};
 
     proptest! {
         #[test]
@@ -174,7 +175,7 @@ mod tests {
         ) {
             let unknowns = 3 * knots + common;
             let mut chain = ChainEquations::new(3 * knots, unknowns, 1e-3);
-            let mut sparse = NormalEquations::new(unknowns, 1e-3);
+            let mut sparse = JointEquations::new(&[Chain { first: 0, knots }], 3, common, 0, 1e-3);
             let mut next = coefficients.iter().cycle().copied();
             let mut draw = move || next.next().unwrap_or(1.0);
             for knot in 0..knots {
@@ -187,7 +188,7 @@ mod tests {
                     sparse.add(&row, value, weight);
                 }
             }
-            let (chain, sparse) = (chain.solve().unwrap(), sparse.solve().unwrap());
+            let (chain, sparse) = (chain.solve().unwrap(), sparse.solve(&mut Elimination::default()).unwrap());
             for (a, b) in chain.iter().zip(&sparse) {
                 prop_assert!((a - b).abs() < 1e-7 * (1.0 + b.abs()), "{a} {b}");
             }

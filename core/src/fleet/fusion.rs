@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    alignment::{RobustScales, Sighting, Target, align},
+    alignment::{Eliminations, RobustScales, Sighting, Target, align, align_one},
     base::Base,
     bridging::{Parts, Placement},
     change::MapChange,
@@ -126,6 +126,7 @@ pub(super) struct Fusion<'a> {
     /// Of each drive, then of the base.
     pub(super) corrections: Vec<Correction>,
     restraints: Vec<Restraints>,
+    eliminations: Eliminations,
     pub(super) placed: Vec<bool>,
     pub(super) lines: Lines,
     /// Where drives went that are laid on the lines.
@@ -150,9 +151,11 @@ impl<'a> Fusion<'a> {
         let lines = base.lines(drives.len(), &Correction::identity());
         let restraints = drives.iter().map(|drive| drive.restraints.clone());
         let restraints = restraints.chain([base.restraints()]).collect();
+        let eliminations = Eliminations::default();
         let is_laid = vec![false; drives.len()];
         let parts = Parts::new(drives.len(), base.drives());
-        Self { drives, params, base, corrections, restraints, placed, lines, ways: base.ways().clone(), is_laid, parts }
+        let ways = base.ways().clone();
+        Self { drives, params, base, corrections, restraints, eliminations, placed, lines, ways, is_laid, parts }
     }
 
     /// Where folded drives went.
@@ -242,9 +245,8 @@ impl<'a> Fusion<'a> {
         for sighting in &mut sightings {
             sighting.drive = 0;
         }
-        let correction = &mut self.corrections[drive..=drive];
         let scales = RobustScales { lanes_m: robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
-        align(&[&self.restraints[drive]], correction, &sightings, 0, scales);
+        align_one(&self.restraints[drive], &mut self.corrections[drive], &sightings, scales);
     }
 
     /// Where lanes of some passes of a drive lie on lines.
@@ -303,7 +305,7 @@ impl<'a> Fusion<'a> {
         }
         let restraints: Vec<&Restraints> = self.restraints.iter().collect();
         let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
-        align(&restraints, &mut self.corrections, &sightings, stations, scales);
+        align(&restraints, &mut self.corrections, &sightings, stations, scales, &mut self.eliminations);
     }
 
     /// Weighs the shape that receivers tell, from the next alignment on, by how far they disagree about it.

@@ -7,7 +7,7 @@
 use nalgebra::{Point3, Rotation3, Vector3};
 
 use super::{
-    alignment::{RobustScales, align},
+    alignment::{RobustScales, align_one},
     contribution::TrajectoryPoint,
     correction::Correction,
     params::FleetParams,
@@ -34,10 +34,9 @@ pub(super) fn by_gnss(
     let first = restraints.fixes.first()?;
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad);
     let shared_from_map = |point: &Point3<f64>| first.shared + turn * (point - first.map);
-    let mut corrections = [Correction::rigid(trajectory, yaw_rad, shared_from_map, params)];
+    let mut correction = Correction::rigid(trajectory, yaw_rad, shared_from_map, params);
     for fixes_m in [UNBOUNDED_M, 4.0 * params.gnss_robust_scale_m, 2.0 * params.gnss_robust_scale_m] {
-        align(&[restraints], &mut corrections, &[], 0, RobustScales { lanes_m: UNBOUNDED_M, fixes_m });
+        align_one(restraints, &mut correction, &[], RobustScales { lanes_m: UNBOUNDED_M, fixes_m });
     }
-    let [correction] = corrections;
     Some(correction)
 }

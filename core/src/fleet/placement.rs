@@ -95,6 +95,7 @@ struct Beside {
     /// How far above the line the sample lies, metres.
     above_m: f64,
     agreement: f64,
+    log_agreement: f64,
 }
 
 impl<'a> Surroundings<'a> {
@@ -170,12 +171,16 @@ fn votes<'a>(lanes: &'a [PreparedLane<'_>], correction: &Correction, lines: &Lin
             let beside = lines.near(&place, reach_m + 2.0).into_iter().filter_map(|(line, knot)| {
                 let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
                 let cosine = normal_of(&lines.lines[line].tangent(knot)).dot(&normal);
-                (cosine.abs() > 0.9 && height_m.abs() < 8.0).then(|| Beside {
-                    line,
-                    parameter,
-                    move_m: -across_m * cosine.signum(),
-                    above_m: height_m,
-                    agreement: agreement(&lane.lane.category_posterior, lines.lines[line].posterior()),
+                (cosine.abs() > 0.9 && height_m.abs() < 8.0).then(|| {
+                    let agreement = agreement(&lane.lane.category_posterior, lines.lines[line].posterior());
+                    Beside {
+                        line,
+                        parameter,
+                        move_m: -across_m * cosine.signum(),
+                        above_m: height_m,
+                        agreement,
+                        log_agreement: agreement.ln(),
+                    }
                 })
             });
             let beside: Vec<Beside> = beside.collect();
@@ -196,10 +201,10 @@ fn agreement(a: &[f64], b: &[f64]) -> f64 {
 fn support(vote: &Vote<'_>, move_m: f64) -> f64 {
     let best = vote.lines.iter().map(|beside| {
         let ratio = (move_m - beside.move_m) / SCATTER_M;
-        beside.agreement * (-0.5 * ratio * ratio).exp()
+        beside.log_agreement - 0.5 * ratio * ratio
     });
     let unmatched = if misfit_m(vote, move_m) > BESIDE_M { OFF_THE_MAP } else { OUTLIER };
-    best.fold(unmatched, f64::max).ln()
+    best.fold(unmatched.ln(), f64::max)
 }
 
 /// Distance from a sample, moved, to the nearest line, metres.

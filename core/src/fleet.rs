@@ -11,7 +11,7 @@
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
 //! 5. [`base`]: where drives crowd, the oldest are folded (`crowding`), so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
-//!    (`persistence`, `moved`), and the most likely history of each stretch (`history`).
+//!    (`persistence`, `moved`), the most likely history of each stretch (`history`), and that of its paint (`repainted`).
 //! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness; where
 //!    witnesses come and go, the line runs on as they say its shape is (`continuity`).
 //!
@@ -72,8 +72,10 @@ mod moved;
 pub mod params;
 mod persistence;
 pub mod placement;
+mod potts;
 mod prepared;
 mod receivers;
+mod repainted;
 mod shown;
 mod sparse;
 pub mod trace;

@@ -13,7 +13,7 @@ import {
 const FLEET = [
   "--roads", "straight", "--shared-route", "--both-directions", "--length-km", "0.5", "--drives", "12", "--changes", "1", "--seed", "3",
 ];
-const KINDS = "kind=appeared,vanished,moved";
+const KINDS = "kind=appeared,vanished,moved,repainted";
 
 let [browser, server, folder] = [];
 before(async () => {
@@ -41,7 +41,7 @@ test("what happened to the road is drawn and listed with how sure it is and when
   await listed(page).first().waitFor({ timeout: PATIENCE_MS });
   const told = (await events()).filter(({ properties }) => !properties.withdrawn);
   assert.equal(await listed(page).count(), Math.min(told.length, 8));
-  assert.match(await listed(page).first().innerText(), /(appeared|vanished|moved)[\s\S]*%[\s\S]*2025/);
+  assert.match(await listed(page).first().innerText(), /(appeared|vanished|moved|now)[\s\S]*%[\s\S]*2025/);
   assert.match(await page.locator("#layer-says").innerText(), new RegExp(`^${told.length} changes? of the road in view`));
   await settled(page);
   await picture(page, "changes-far");
@@ -49,7 +49,7 @@ test("what happened to the road is drawn and listed with how sure it is and when
   await listed(page).first().locator("button").click();
   const card = page.locator("#card");
   await card.locator("h2").waitFor();
-  assert.match(await card.locator("h2").innerText(), /appeared|vanished|moved/);
+  assert.match(await card.locator("h2").innerText(), /appeared|vanished|moved|now/);
   assert.match(await card.innerText(), /probability[\s\S]*noticed[\s\S]*drive of/);
   await settled(page);
   assert.deepEqual(await found(page), [], "the card of a change");

@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 
+use lanemap_core::Category;
 use lanemap_proto::{
     v1::{
         self, admin_service_client::AdminServiceClient, map_service_client::MapServiceClient,
@@ -116,6 +117,66 @@ fn places_of(event: &Value) -> Vec<[f64; 2]> {
 fn changing_road() -> ChangingRoad {
     let each = ChangePlan { vanished: 1, appeared: 1, max_length_m: 100.0, ..ChangePlan::none() };
     along_a_changing_road(33, 12, ChangePlan { first_drive: 6, last_drive: 6, ..each })
+}
+
+/// The believed events of the road of a server that all drives were uploaded to.
+async fn told_of_road(road: &ChangingRoad) -> Vec<Value> {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::lively(folder.path(), |_| ()).await;
+    let url = server.url();
+    for drive in &road.drives {
+        drive.upload_whole(&url).await;
+        settled(&server).await;
+    }
+    let mut events = events_of(&url).await;
+    events.retain(|event| !event["geometry"].is_null() && event["properties"]["withdrawn"] == false);
+    server.shutdown().await;
+    events
+}
+
+/// The only event of a road, which is of a kind and lies along a line.
+fn only_event<'a>(events: &'a [Value], kind: &str, line: &[[f64; 2]]) -> &'a Value {
+    let [event] = events else { panic!("one thing happened: {events:#?}") };
+    assert_eq!(event["properties"]["kind"], kind);
+    assert!(share_near(&places_of(event), line, 3.0) > 0.8, "{event} is not at {line:?}");
+    assert!(event["properties"]["probability"].as_f64().unwrap() > 0.8, "{event}");
+    event
+}
+
+/// Roads of which a line moves by 0.8 to 1.5 m, and one of which a stretch is repainted.
+const MOVES: [u64; 3] = [4, 6, 11];
+const REPAINTED: u64 = 2;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_line_that_moves_is_told_once_with_its_probability_and_how_far() {
+    for seed in MOVES {
+        let each = ChangePlan { moved: 1, max_length_m: 100.0, ..ChangePlan::none() };
+        let road = along_a_changing_road(seed, 12, ChangePlan { first_drive: 6, last_drive: 6, ..each });
+        let [(ChangeKind::Moved { left_m }, _, after)] = road.changes.as_slice() else { panic!("{:?}", road.changes) };
+        let events = told_of_road(&road).await;
+        let event = only_event(&events, "moved", after);
+        let told_m = event["properties"]["moved_m"].as_f64().unwrap();
+        assert!((told_m - left_m.abs()).abs() < 0.25, "{told_m} m of {left_m} m");
+        let noticed = event["properties"]["noticed"].as_str().unwrap();
+        assert!(("2025-01-07".."2025-01-13").contains(&noticed), "{noticed}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stretch_that_is_repainted_is_told_once_with_what_it_was_and_is() {
+    let each = ChangePlan { repainted: 1, max_length_m: 100.0, ..ChangePlan::none() };
+    let road = along_a_changing_road(REPAINTED, 12, ChangePlan { first_drive: 6, last_drive: 6, ..each });
+    let [(ChangeKind::Repainted { from, to }, _, after)] = road.changes.as_slice() else {
+        panic!("{:?}", road.changes)
+    };
+    let events = told_of_road(&road).await;
+    let event = only_event(&events, "repainted", after);
+    // Most of the stretch, and little of the line beside it.
+    assert!(share_near(after, &places_of(event), 5.0) > 0.7, "{event}");
+    let code = |category: &Value| category.as_str().unwrap().replace('_', "");
+    let name = |category: &Category| format!("{category:?}").to_lowercase();
+    assert_eq!(code(&event["properties"]["category_before"]), name(from));
+    assert_eq!(code(&event["properties"]["category"]), name(to));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -163,7 +163,7 @@ class Watching(unittest.TestCase):
     def test_events_and_the_history_of_a_line_are_read(self):
         renamed = dict(kind="renamed", version=3, at="2026-01-01T00:00:00Z")
         history = dict(
-            cell="14-1-2", lane="b", versions=[], events=[event_feature("moved", moved_m=0.7)],
+            cell="14-1-2", lane="b", versions=[], events=[event_feature("moved", moved_m=0.7), event_feature("repainted", category_before="white_dashed")],
             came_from=[dict(renamed, lane="a")], became=[dict(renamed, kind="split", lanes=["b", "c"])],
         )
         service = Service(self, answer({"features": [event_feature("renamed", into=["b"])], "more": False}), answer(history))
@@ -172,6 +172,7 @@ class Watching(unittest.TestCase):
         self.assertEqual((event.into, event.withdrawn), (("b",), False))
         read = map.history("14-1-2", "b")
         self.assertEqual((read.came_from[0].lanes, read.became[0].lanes, read.events[0].moved_m), (("a",), ("b", "c"), 0.7))
+        self.assertEqual([event.category_before for event in read.events], [None, lanemap.Category.WHITE_DASHED])
         paths = [path for path, _ in service.requests]
         self.assertEqual(paths[1], "/cells/14-1-2/lanes/b/history")
         self.assertIn("kind=renamed", paths[0])

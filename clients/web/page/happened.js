@@ -7,12 +7,13 @@ import { categoryName } from "./paint.js";
 /** Events that are listed; all in view are drawn. */
 const MOST_LISTED = 8;
 /** What is asked for: what happened to the road, not to names. */
-export const PATH = "events?kind=appeared,vanished,moved&limit=500";
+export const PATH = "events?kind=appeared,vanished,moved,repainted&limit=500";
 
 const SAYS = {
   appeared: "Drives before saw no line here; later ones do.",
   vanished: "Drives that had this stretch in view see no line any more. It is drawn where it was.",
   moved: "The line lies elsewhere than before. It is drawn where it is now.",
+  repainted: "The line lies where it was, painted otherwise.",
 };
 
 /** What is believed of what was told. */
@@ -31,7 +32,8 @@ export function drawn(events) {
 }
 
 /** The line to which it happened, and what did. */
-export const title = ({ properties }) => `${categoryName(properties.category)} ${properties.kind}`;
+export const title = ({ properties: { category, category_before, kind } }) =>
+  category_before === undefined ? `${categoryName(category)} ${kind}` : `${categoryName(category_before)} now ${categoryName(category)}`;
 
 /** How sure it is. */
 export const sureness = ({ properties: { probability } }) => (probability > 0.995 ? ">99 %" : `${Math.round(probability * 100)} %`);

@@ -83,7 +83,7 @@ function chosenLayer(view, colours) {
 }
 
 const KIND = ["get", "kind"];
-const colourOfKind = (colours) => ["match", KIND, "vanished", colours.vanished, "moved", colours.moved, colours.appeared];
+const colourOfKind = (colours) => ["match", KIND, "vanished", colours.vanished, "moved", colours.moved, "repainted", colours.repainted, colours.appeared];
 
 /** Where the map is another one than it was. */
 function changeLayers(colours, latitude) {

@@ -140,7 +140,7 @@ function paints() {
 
 function changes() {
   const list = document.createElement("ul");
-  const kinds = [["appeared", "appeared"], ["moved", "moved"], ["vanished", "vanished, dashed"]];
+  const kinds = [["appeared", "appeared"], ["moved", "moved"], ["repainted", "repainted"], ["vanished", "vanished, dashed"]];
   list.append(...kinds.map(([kind, name]) => {
     const item = document.createElement("li");
     item.innerHTML = `<span class="dash-swatch"></span>`;

@@ -3,7 +3,7 @@
 const KEPT = "lanemap.theme";
 const NAMES = [
   "ground", "grid", "grid-major", "verge", "asphalt", "ribbon", "white-paint", "yellow-paint", "curb", "unknown-paint",
-  "chosen", "truth", "appeared", "moved", "vanished", "card", "accent", "ink", "ink-soft",
+  "chosen", "truth", "appeared", "moved", "repainted", "vanished", "card", "accent", "ink", "ink-soft",
 ];
 const system = matchMedia("(prefers-color-scheme: dark)");
 const still = matchMedia("(prefers-reduced-motion: reduce)");

@@ -3,7 +3,7 @@
 //! Both the true changes and the reported ones are told as paint that went and paint that came: a line that moved went from one
 //! place and came to another. They are cut into pieces of [`PIECE_M`] metres. A true piece is recalled if one of a report of the
 //! same sense, made since, overlaps it, at most 1.5 m across; a reported piece is right if it so overlaps a true one of
-//! the same sense and before it. A report that a line moved speaks for both: where it is now, and, within 3 m, where it was.
+//! the same sense and before it. Paint that is of another category now is a sense of its own, told rightly if the new category is. A report that a line moved speaks for both: where it is now, and, within 3 m, where it was.
 //! The latency of a change is the number of drives with it in view that began after it, up to and with the one by which its
 //! first report came to be believed.
 //!
@@ -13,6 +13,7 @@ use nalgebra::{Point3, Vector2};
 
 use super::quantile;
 use crate::{
+    category::Category,
     fleet::{ChangeKind, MapChange},
     frame::TimestampNs,
 };
@@ -33,6 +34,8 @@ pub struct TrueChange {
     pub went: Vec<Point3<f64>>,
     /// Where paint is that was not there; empty where nothing came.
     pub came: Vec<Point3<f64>>,
+    /// Where paint is of another category than it was, and which; empty where nothing is.
+    pub repainted: (Vec<Point3<f64>>, Category),
     /// Starts of the drives that had it in view, before it and since.
     pub in_view: Vec<TimestampNs>,
     /// Whether it is missed where it is not reported.
@@ -56,11 +59,12 @@ pub struct ChangeScore {
     pub latency_drives_p50: f64,
 }
 
-/// Whether paint went or came.
+/// Whether paint went or came, or what it became.
 #[derive(Clone, Copy, PartialEq)]
 enum Sense {
     Went,
     Came,
+    Became(Category),
 }
 
 struct Piece {
@@ -124,14 +128,17 @@ fn pieces_of_truth(of: usize, change: &TrueChange) -> Vec<Piece> {
     let piece =
         |sense| move |(middle, direction)| Piece { middle, direction, sense, time: change.time, reach_m: NEAR_M, of };
     let went = middles(&change.went).into_iter().map(piece(Sense::Went));
-    went.chain(middles(&change.came).into_iter().map(piece(Sense::Came))).collect()
+    let came = middles(&change.came).into_iter().map(piece(Sense::Came));
+    let (repainted, category) = &change.repainted;
+    went.chain(came).chain(middles(repainted).into_iter().map(piece(Sense::Became(*category)))).collect()
 }
 
 fn pieces_of_report(of: usize, change: &MapChange) -> Vec<Piece> {
-    let senses: &[(Sense, f64)] = match change.kind {
-        ChangeKind::Appeared => &[(Sense::Came, NEAR_M)],
-        ChangeKind::Vanished => &[(Sense::Went, NEAR_M)],
-        ChangeKind::Moved { .. } => &[(Sense::Came, NEAR_M), (Sense::Went, MOVED_M)],
+    let senses = match change.kind {
+        ChangeKind::Appeared => vec![(Sense::Came, NEAR_M)],
+        ChangeKind::Vanished => vec![(Sense::Went, NEAR_M)],
+        ChangeKind::Moved { .. } => vec![(Sense::Came, NEAR_M), (Sense::Went, MOVED_M)],
+        ChangeKind::Repainted { to, .. } => vec![(Sense::Became(to), NEAR_M)],
     };
     let middles = middles(&change.points);
     let piece = |(sense, reach_m): &(Sense, f64)| {
@@ -184,7 +191,8 @@ mod tests {
 
     fn truth(went: Vec<Point3<f64>>, came: Vec<Point3<f64>>) -> TrueChange {
         let in_view = (0..6).map(|drive| TimestampNs(10 * drive)).collect();
-        TrueChange { time: TimestampNs(15), went, came, in_view, asked: true }
+        let repainted = (Vec::new(), Category::Unknown);
+        TrueChange { time: TimestampNs(15), went, came, repainted, in_view, asked: true }
     }
 
     fn report(kind: ChangeKind, points: Vec<Point3<f64>>, noticed: i64) -> MapChange {
@@ -229,6 +237,18 @@ mod tests {
         let score = score_changes(&[report(ChangeKind::Vanished, along(0, 50, 3.4), 30)], &[hardly_seen]);
         assert_eq!((score.true_pieces, score.reported_pieces), (0, 5));
         assert!((score.recall - 1.0).abs() < 1e-9 && (score.precision - 1.0).abs() < 1e-9, "{score:?}");
+    }
+
+    #[test]
+    fn paint_that_became_another_is_told_rightly_by_the_new_category_alone() {
+        let repainted = (along(0, 100, 0.0), Category::WhiteSolid);
+        let truth = [TrueChange { repainted, ..truth(Vec::new(), Vec::new()) }];
+        let told = |to| ChangeKind::Repainted { from: Category::WhiteDashed, to };
+        let right = score_changes(&[report(told(Category::WhiteSolid), along(0, 100, 0.1), 30)], &truth);
+        assert!((right.recall - 1.0).abs() < 1e-9 && (right.precision - 1.0).abs() < 1e-9, "{right:?}");
+        let wrong = score_changes(&[report(told(Category::YellowDashed), along(0, 100, 0.1), 30)], &truth);
+        assert!(wrong.recall < 1e-9 && wrong.precision < 1e-9, "{wrong:?}");
+        assert_eq!(wrong.false_removals, 0);
     }
 
     #[test]

@@ -105,12 +105,7 @@ const GAUSS_NEWTON_STEPS: usize = 2;
 const WEAK: f64 = 1e-9;
 
 /// Solves for the correction of one drive, whose sightings are of lines that stay where they are.
-pub(super) fn align_one(
-    drive: &Restraints,
-    correction: &mut Correction,
-    sightings: &[Sighting],
-    scales: RobustScales,
-) {
+pub(super) fn align_one(drive: &Restraints, correction: &mut Correction, sightings: &[Sighting], scales: RobustScales) {
     align(&[drive], std::slice::from_mut(correction), sightings, 0, scales, &mut Eliminations::default());
 }
 
@@ -163,21 +158,35 @@ impl Layout {
     }
 }
 
+/// The coefficients of one equation: of few unknowns.
+#[derive(Clone, Copy, Debug, Default)]
+struct Row {
+    entries: [(usize, f64); 7],
+    len: usize,
+}
+
+impl Row {
+    fn push(&mut self, unknown: usize, coefficient: f64) {
+        self.entries[self.len] = (unknown, coefficient);
+        self.len += 1;
+    }
+
+    fn entries(&self) -> &[(usize, f64)] {
+        &self.entries[..self.len]
+    }
+}
+
 /// Derivatives of `axis . C(p)` by the unknowns of the knots beside it.
-fn row_across(
-    first: usize,
-    correction: &Correction,
-    map: &Point3<f64>,
-    arc_m: f64,
-    axis: &Vector2<f64>,
-) -> Vec<(usize, f64)> {
+fn row_across(first: usize, correction: &Correction, map: &Point3<f64>, arc_m: f64, axis: &Vector2<f64>) -> Row {
     let (knot, weight) = correction.locate(arc_m);
-    let mut row = Vec::with_capacity(8);
+    let mut row = Row::default();
     for (knot, weight) in [(knot, 1.0 - weight), (knot + 1, weight)] {
         if weight > 0.0 {
             let at = first + 3 * knot;
             let by_yaw = correction.knots[knot].by_yaw(map).dot(axis);
-            row.extend([(at, weight * axis.x), (at + 1, weight * axis.y), (at + 2, weight * by_yaw)]);
+            row.push(at, weight * axis.x);
+            row.push(at + 1, weight * axis.y);
+            row.push(at + 2, weight * by_yaw);
         }
     }
     row
@@ -209,12 +218,12 @@ fn align_horizontally(
         let value = match sighting.across {
             Target::Fixed(target) => target - place,
             Target::Station(station) => {
-                row.push((layout.stations + station, -1.0));
+                row.push(layout.stations + station, -1.0);
                 -place
             }
         };
         let weight = robust_weight(residual, scales.lanes_m) / sighting.lateral_variance_m2;
-        equations.add(&row, value, weight);
+        equations.add(row.entries(), value, weight);
     }
     let Some(step) = equations.solve(elimination) else { return };
     for (correction, chain) in corrections.iter_mut().zip(&layout.chains) {
@@ -269,8 +278,8 @@ fn add_fixes(
         let weight = robust_weight((offset - common).norm(), robust_scale_m) / (sigma_m * sigma_m);
         for (axis, bias, value) in [(Vector2::x(), bias, offset.x), (Vector2::y(), bias + 1, offset.y)] {
             let mut row = row_across(first, correction, &fix.map, fix.arc_m, &axis);
-            row.push((bias, 1.0));
-            equations.add(&row, value, weight);
+            row.push(bias, 1.0);
+            equations.add(row.entries(), value, weight);
         }
     }
     for unknown in [bias, bias + 1] {
@@ -344,12 +353,12 @@ fn align_heights(
         let value = match sighting.height {
             Target::Fixed(target) => target - place,
             Target::Station(station) => {
-                row.push((layout.stations + station, -1.0));
+                row.push(layout.stations + station, -1.0);
                 -place
             }
         };
         let weight = robust_weight(residual, 2.0 * scales.lanes_m) / sighting.height_variance_m2;
-        equations.add(&row, value, weight);
+        equations.add(row.entries(), value, weight);
     }
     let Some(step) = equations.solve(elimination) else { return };
     for (correction, chain) in corrections.iter_mut().zip(&layout.chains) {
@@ -359,11 +368,12 @@ fn align_heights(
     }
 }
 
-fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Vec<(usize, f64)> {
+fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Row {
     let (knot, weight) = correction.locate(arc_m);
-    let mut row = vec![(first + knot, 1.0 - weight)];
+    let mut row = Row::default();
+    row.push(first + knot, 1.0 - weight);
     if weight > 0.0 {
-        row.push((first + knot + 1, weight));
+        row.push(first + knot + 1, weight);
     }
     row
 }
@@ -376,9 +386,9 @@ fn add_fixed_heights(equations: &mut impl Equations, first: usize, drive: &Restr
     for fix in &drive.fixes {
         let [_, sigma_m] = fix.sigma_m;
         let mut row = row_of_height(first, correction, fix.arc_m);
-        row.push((bias, 1.0));
+        row.push(bias, 1.0);
         let offset = fix.shared.z - correction.apply(&fix.map, fix.arc_m).z;
-        equations.add(&row, offset, 1.0 / (sigma_m * sigma_m));
+        equations.add(row.entries(), offset, 1.0 / (sigma_m * sigma_m));
     }
     equations.add(&[(bias, 1.0)], 0.0, drive.bias_sigma_m[1].powi(-2));
 }

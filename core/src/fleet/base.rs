@@ -118,9 +118,9 @@ impl Correction {
 impl Fusion<'_> {
     /// Folds the drives into the base.
     pub(super) fn into_base(self, before: &Base) -> Base {
-        let beliefs = self.beliefs();
+        let (beliefs, paints) = (self.beliefs(), self.paints());
         let mut lines = Vec::with_capacity(self.lines.lines.len());
-        for (index, (line, beliefs)) in self.lines.lines.iter().zip(&beliefs).enumerate() {
+        for (index, ((line, beliefs), paints)) in self.lines.lines.iter().zip(&beliefs).zip(&paints).enumerate() {
             let knots = (0..line.points.len()).map(|knot| {
                 let normal = normal_of(&line.tangent(knot));
                 let mean = line.mean_offset(knot, &normal, self.params);
@@ -128,7 +128,11 @@ impl Fusion<'_> {
                     place: line.points[knot],
                     lateral_variance_m2: 1.0 / mean.across_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
                     height_variance_m2: 1.0 / mean.height_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
-                    record: KnotRecord { drives: line.knots[knot].drives(), belief: Some(beliefs[knot]) },
+                    record: KnotRecord {
+                        drives: line.knots[knot].drives(),
+                        belief: Some(beliefs[knot]),
+                        paint: Some(paints[knot]),
+                    },
                 }
             });
             lines.push(BaseLine {

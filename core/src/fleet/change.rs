@@ -2,10 +2,10 @@
 //!
 //! Every knot of every line has a most likely history (`history`). Neighbouring knots that came, or went, are one event, noticed
 //! with the drive by which half of them were believed. A stretch that went beside one that came, at most 2.5 m
-//! across, was moved. The probability of an event is the mean of its knots'.
+//! across, was moved. Neighbouring knots that are there and whose category changed alike were repainted (`repainted`). The
+//! probability of an event is the mean of its knots'.
 //!
-//! Not guaranteed: a move by less than about half a metre, and a new category on a part of a line, which a drive's own map
-//! does not tell.
+//! Not guaranteed: a move by less than about half a metre.
 
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
@@ -16,8 +16,9 @@ use super::{
     history::{Belief, Turn},
     line::{FusedLaneId, Lines},
     persistence::Speaker,
+    repainted::Paint,
 };
-use crate::frame::TimestampNs;
+use crate::{category::Category, frame::TimestampNs};
 
 /// What happened to a stretch of road.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,6 +31,13 @@ pub enum ChangeKind {
     Moved {
         /// How far, metres.
         by_m: f64,
+    },
+    /// A line lies where it was, painted otherwise.
+    Repainted {
+        /// What it was.
+        from: Category,
+        /// What it is.
+        to: Category,
     },
 }
 
@@ -70,13 +78,16 @@ struct Stretch {
 
 impl Fusion<'_> {
     /// Every change that is believed, in the order in which they came to be.
-    pub(super) fn changes(&self, beliefs: &[Vec<Belief>]) -> Vec<MapChange> {
+    pub(super) fn changes(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>]) -> Vec<MapChange> {
         let mut stretches = Vec::new();
         for (line, beliefs) in beliefs.iter().enumerate() {
             stretches.extend(stretches_of(line, beliefs));
         }
         stretches.retain(|stretch| stretch.noticed.len() >= LEAST_KNOTS);
         let mut changes = events(&self.lines, &stretches);
+        for (line, (beliefs, paints)) in beliefs.iter().zip(paints).enumerate() {
+            changes.extend(repaints(&self.lines, line, beliefs, paints));
+        }
         changes.sort_by_key(|change| (change.noticed, change.noticed_by, change.lane));
         changes
     }
@@ -145,14 +156,49 @@ fn change(lines: &Lines, stretch: &Stretch, kind: ChangeKind) -> MapChange {
     }
 }
 
-/// Mean distance of the knots of one stretch from the nearest of another; `None` where less than half have one near.
+/// Where a line that is there was repainted.
+fn repaints(lines: &Lines, line: usize, beliefs: &[Belief], paints: &[Paint]) -> Vec<MapChange> {
+    let mut stretches: Vec<(ChangeKind, Stretch)> = Vec::new();
+    for (knot, (belief, paint)) in beliefs.iter().zip(paints).enumerate() {
+        let Some(repaint) = paint.change.filter(|_| belief.is_shown()) else { continue };
+        let kind = ChangeKind::Repainted { from: repaint.from, to: repaint.to };
+        match stretches.last_mut() {
+            Some((open, stretch)) if *open == kind && knot - stretch.last <= BRIDGED_KNOTS + 1 => {
+                stretch.last = knot;
+                stretch.noticed.push(repaint.noticed);
+                stretch.probability_sum += repaint.probability;
+            }
+            _ => stretches.push((
+                kind,
+                Stretch {
+                    line,
+                    turn: Turn::Came,
+                    first: knot,
+                    last: knot,
+                    noticed: vec![repaint.noticed],
+                    probability_sum: repaint.probability,
+                },
+            )),
+        }
+    }
+    stretches.retain(|(_, stretch)| stretch.noticed.len() >= LEAST_KNOTS);
+    stretches.iter().map(|(kind, stretch)| change(lines, stretch, *kind)).collect()
+}
+
+/// Mean distance of the knots of one stretch from another; `None` where less than half have it near.
 fn distance_m(lines: &Lines, a: &Stretch, b: &Stretch) -> Option<f64> {
     let points = |stretch: &Stretch| &lines.lines[stretch.line].points[stretch.first..=stretch.last];
-    let nearest = points(a).iter().map(|point| {
-        let to_b = points(b).iter().map(|other| (other - point).xy().norm());
-        to_b.fold(f64::INFINITY, f64::min)
+    let distances = points(a).iter().map(|point| {
+        let chords = points(b).windows(2).map(|pair| from_chord_m(point, &pair[0], &pair[1]));
+        chords.fold(f64::INFINITY, f64::min)
     });
-    // Knots of the two lie beside each other to within half a chord.
-    let near: Vec<f64> = nearest.filter(|distance| *distance <= MOVED_M + 1.5).collect();
+    let near: Vec<f64> = distances.filter(|distance| *distance <= MOVED_M).collect();
     (2 * near.len() >= a.noticed.len()).then(|| near.iter().sum::<f64>() / near.len() as f64)
+}
+
+/// Distance of a place from a chord, horizontally.
+fn from_chord_m(place: &Point3<f64>, from: &Point3<f64>, to: &Point3<f64>) -> f64 {
+    let (along, offset) = ((to - from).xy(), (place - from).xy());
+    let share = (offset.dot(&along) / along.norm_squared().max(1e-12)).clamp(0.0, 1.0);
+    (offset - along * share).norm()
 }

@@ -34,10 +34,7 @@ impl CorrectionKnot {
     /// `T_k(p)`.
     #[must_use]
     pub fn apply(&self, point_map: &Point3<f64>) -> Point3<f64> {
-        let offset = point_map - self.map;
-        let (sin, cos) = self.yaw_rad.sin_cos();
-        let turned = Vector3::new(cos * offset.x - sin * offset.y, sin * offset.x + cos * offset.y, offset.z);
-        self.shared + turned
+        self.shared + turned(&(point_map - self.map), self.yaw_rad.sin_cos())
     }
 
     /// Derivative of `T_k(p)` by `psi_k`, horizontally.
@@ -100,9 +97,7 @@ impl Correction {
 
     /// A direction in the drive's frame at an arc length, in the shared one.
     pub(super) fn turn(&self, direction: &Vector3<f64>, arc_m: f64) -> Vector3<f64> {
-        let (sin, cos) = self.yaw_rad(arc_m).sin_cos();
-        let (x, y) = (cos * direction.x - sin * direction.y, sin * direction.x + cos * direction.y);
-        Vector3::new(x, y, direction.z)
+        turned(direction, self.yaw_rad(arc_m).sin_cos())
     }
 
     /// Turn from the drive's frame to the shared one at an arc length, radians.
@@ -112,6 +107,61 @@ impl Correction {
         let before = self.knots[knot].yaw_rad;
         if weight == 0.0 { before } else { before + (self.knots[knot + 1].yaw_rad - before) * weight }
     }
+}
+
+/// Applies a correction to places one after the other: what is the same between two knots is found once for all of them.
+#[derive(Clone, Debug)]
+pub(super) struct CorrectionWalk<'a> {
+    correction: &'a Correction,
+    /// The knot before, and the sine and cosine of its turn and of that of the next.
+    knot: usize,
+    turns: [(f64, f64); 2],
+}
+
+impl<'a> CorrectionWalk<'a> {
+    pub(super) fn new(correction: &'a Correction) -> Self {
+        Self { correction, knot: 0, turns: Self::turns(correction, 0) }
+    }
+
+    fn turns(correction: &Correction, knot: usize) -> [(f64, f64); 2] {
+        let next = (knot + 1).min(correction.knots.len() - 1);
+        [knot, next].map(|knot| correction.knots[knot].yaw_rad.sin_cos())
+    }
+
+    /// As [`Correction::apply`], and the direction in the shared frame, of length 1 to within the change of turn between two knots.
+    pub(super) fn apply(
+        &mut self,
+        point_map: &Point3<f64>,
+        direction: &Vector3<f64>,
+        arc_m: f64,
+    ) -> (Point3<f64>, Vector3<f64>) {
+        let knots = &self.correction.knots;
+        let holds = |knot: usize| {
+            (knot == 0 || knots[knot].arc_m <= arc_m) && (knot + 1 == knots.len() || arc_m < knots[knot + 1].arc_m)
+        };
+        if !holds(self.knot) {
+            (self.knot, _) = self.correction.locate(arc_m);
+            self.turns = Self::turns(self.correction, self.knot);
+        }
+        let at = |knot: &CorrectionKnot, turn: (f64, f64)| {
+            (knot.shared + turned(&(point_map - knot.map), turn), turned(direction, turn))
+        };
+        let before = &knots[self.knot];
+        let (place, heading) = at(before, self.turns[0]);
+        match knots.get(self.knot + 1) {
+            Some(next) if arc_m > before.arc_m => {
+                let share = (arc_m - before.arc_m) / (next.arc_m - before.arc_m);
+                let (next_place, next_heading) = at(next, self.turns[1]);
+                (place + (next_place - place) * share, heading + (next_heading - heading) * share)
+            }
+            _ => (place, heading),
+        }
+    }
+}
+
+/// A direction turned about the vertical.
+fn turned(direction: &Vector3<f64>, (sin, cos): (f64, f64)) -> Vector3<f64> {
+    Vector3::new(cos * direction.x - sin * direction.y, sin * direction.x + cos * direction.y, direction.z)
 }
 
 /// Indices of the trajectory points at which a correction has knots: the first, and one every `spacing_m`.

@@ -3,8 +3,7 @@
 //! A knot has a history: it was there all the time, never, or it came or went once or twice, each time between two passes. Its
 //! likelihood is the product of what every pass says, `P(seen | there)` or `P(seen | not there)`; and since what a pass
 //! sees of one knot and of the next is mostly one sight, each counts for a share of one. Neighbouring knots have mostly the same
-//! history: a chain with a Potts prior along the line, `P(h' | h) = (1 - e) [h' = h] + e pi(h')`, whose marginals are exact
-//! by one pass forward and one backward. Noise of single drives and single knots does not make a change; what a few drives say
+//! history: a chain with a Potts prior along the line ([`potts`]). Noise of single drives and single knots does not make a change; what a few drives say
 //! of a whole stretch does. The idea of persistence as a probability is that of Rosen, Mason and Leonard, *Towards Lifelong
 //! Feature-Based Mapping in Semi-Static Environments* (ICRA 2016); the chain over space is ours.
 //!
@@ -14,7 +13,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::persistence::{Hearing, Speaker};
+use super::{
+    persistence::{Hearing, Speaker},
+    potts,
+};
 use crate::frame::TimestampNs;
 
 /// Least probability that a pass misses what is there: a pass may be wrong as a whole.
@@ -47,6 +49,13 @@ pub(super) struct Belief {
     pub(super) confirmed: Option<TimestampNs>,
     /// The last change, and the drive that made it believed.
     pub(super) change: Option<(Turn, Speaker)>,
+}
+
+impl Belief {
+    /// Whether it is there, and its paint on no other line.
+    pub(super) fn is_shown(&self) -> bool {
+        self.probability >= 0.5 && !self.doubled
+    }
 }
 
 /// What becomes of a knot.
@@ -276,47 +285,15 @@ impl Histories {
 /// Marginal probabilities of every knot after the first `passes` passes.
 fn marginals(sayings: &[Saying], passes: usize) -> Vec<Marginal> {
     let histories = Histories { passes };
-    let prior = histories.prior();
-    let mut forward: Vec<Vec<f64>> = Vec::with_capacity(sayings.len());
-    let mut likelihood = Vec::with_capacity(prior.len());
-    for (knot, saying) in sayings.iter().enumerate() {
-        histories.likelihoods(saying, &mut likelihood);
-        let mut here: Vec<f64> = match knot.checked_sub(1) {
-            None => prior.iter().zip(&likelihood).map(|(prior, own)| prior * own).collect(),
-            Some(before) => {
-                let onward = forward[before].iter().zip(&prior).zip(&likelihood);
-                onward.map(|((before, prior), own)| ((1.0 - ANOTHER) * before + ANOTHER * prior) * own).collect()
-            }
-        };
-        normalise(&mut here);
-        forward.push(here);
-    }
     let mut marginals = vec![Marginal::default(); sayings.len()];
-    let mut backward = vec![1.0; prior.len()];
-    let mut joint = vec![0.0; prior.len()];
-    for knot in (0..sayings.len()).rev() {
-        for ((joint, forward), backward) in joint.iter_mut().zip(&forward[knot]).zip(&backward) {
-            *joint = forward * backward;
-        }
-        marginals[knot] = histories.marginal(&joint);
-        histories.likelihoods(&sayings[knot], &mut likelihood);
-        for (backward, own) in backward.iter_mut().zip(&likelihood) {
-            *backward *= own;
-        }
-        let mean: f64 = prior.iter().zip(&backward).map(|(prior, backward)| prior * backward).sum();
-        // Of the scale 1 at the mean: what matters is the ratio.
-        for backward in &mut backward {
-            *backward = (1.0 - ANOTHER) * *backward / mean + ANOTHER;
-        }
-    }
+    potts::marginals(
+        sayings.len(),
+        &histories.prior(),
+        ANOTHER,
+        |knot, of| histories.likelihoods(&sayings[knot], of),
+        |knot, joint| marginals[knot] = histories.marginal(joint),
+    );
     marginals
-}
-
-fn normalise(probabilities: &mut [f64]) {
-    let total: f64 = probabilities.iter().sum();
-    for probability in probabilities {
-        *probability /= total;
-    }
 }
 
 #[cfg(test)]

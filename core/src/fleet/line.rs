@@ -20,6 +20,7 @@ use super::{
     history::Belief,
     params::FleetParams,
     prepared::{PreparedLane, normal_of},
+    repainted::Paint,
 };
 use crate::{
     category::Category,
@@ -152,6 +153,8 @@ pub(super) struct KnotRecord {
     pub(super) drives: u32,
     /// `None` of a knot that none of them had.
     pub(super) belief: Option<Belief>,
+    /// The same of its paint.
+    pub(super) paint: Option<Paint>,
 }
 
 /// All lines, and which run near a place.

@@ -5,17 +5,20 @@
 //! of one drive do not share a stretch of a line: where two want it, the one that fits it better has it.
 //! A lane may run against the line's direction: oncoming traffic sees the same paint.
 
-use std::{collections::BTreeMap, ops::RangeInclusive};
+use std::ops::RangeInclusive;
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector2, Vector3};
 
 use super::{
-    correction::Correction,
+    correction::{Correction, CorrectionWalk},
     line::Lines,
     params::FleetParams,
-    prepared::{PreparedLane, normal_of},
+    prepared::{PreparedLane, count_of, normal_of},
 };
-use crate::{category::Category, spline::foot_point::foot_point_refined};
+use crate::{
+    category::Category,
+    spline::foot_point::{FootOffset, foot_offset},
+};
 
 /// A stretch of a lane that lies on one line.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,6 +54,19 @@ const LEAST_COSINE: f64 = 0.88;
 const SHORTEST_RUN: usize = 3;
 /// Knots by which a lane may jump along a line between two samples.
 const LONGEST_JUMP: f64 = 3.0;
+/// Way after which lines are looked for again, and followed in between, metres: no line is so short that it lies between.
+const LOOKED_FOR_EACH_M: f64 = 12.0;
+
+/// Candidates of every sample of a lane, one sample after the other.
+#[derive(Debug, Default)]
+struct Candidates {
+    all: Vec<Candidate>,
+    /// Where those of each sample end.
+    ends: Vec<usize>,
+}
+
+/// Lines near one sample, each with its nearest knot.
+type Near = Vec<(usize, usize)>;
 
 /// Runs of one lane on the lines, in the order of the lane. `is_taken` tells which stretches other lanes of the drive have.
 pub(super) fn match_lane(
@@ -60,30 +76,93 @@ pub(super) fn match_lane(
     is_taken: &dyn Fn(usize, f64) -> bool,
     params: &FleetParams,
 ) -> Vec<Run> {
-    let mut agreement = BTreeMap::new();
-    let mut cost_of_category = |line: usize| {
-        let cost = || category_cost(&lane.lane.category_posterior, lines.lines[line].posterior());
-        *agreement.entry(line).or_insert_with(cost)
-    };
-    let candidates = lane.samples.iter().map(|sample| {
-        let place = correction.apply(&sample.map, sample.arc_m);
-        let direction = correction.turn(&sample.tangent, sample.arc_m).xy();
-        let variance = sample.lateral_variance_m2 + ALIGNMENT_SIGMA_M.powi(2);
-        let near = lines.near(&place, params.gate_m + params.line_knot_m);
-        let candidates = near.into_iter().filter_map(|(line, knot)| {
-            let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
-            let tangent = lines.lines[line].tangent(knot).xy();
-            let parallel = direction.dot(&tangent).abs() >= LEAST_COSINE * direction.norm() * tangent.norm();
-            let within = across_m.abs() <= params.gate_m && height_m.abs() <= params.gate_height_m;
-            (parallel && within && !is_taken(line, parameter)).then(|| Candidate {
-                line,
-                parameter,
-                cost: 0.5 * across_m * across_m / variance + cost_of_category(line),
-            })
-        });
-        candidates.collect()
-    });
-    runs(&candidates.collect::<Vec<Vec<Candidate>>>())
+    let mut walk = CorrectionWalk::new(correction);
+    let shared: Vec<(Point3<f64>, Vector3<f64>)> =
+        lane.samples.iter().map(|sample| walk.apply(&sample.map, &sample.tangent, sample.arc_m)).collect();
+    let near = |sample: usize| lines.near(&shared[sample].0, params.gate_m + params.line_knot_m);
+    let mut agreement: Vec<(usize, f64)> = Vec::new();
+    let mut candidates = Candidates::default();
+    let Some(last) = shared.len().checked_sub(1) else { return Vec::new() };
+    let step_m = nalgebra::distance(&shared[0].0, &shared[last.min(1)].0).max(params.sample_m);
+    let stretch = count_of(LOOKED_FOR_EACH_M / step_m).max(1);
+    let mut at_start: Near = near(0);
+    for start in (0..=last).step_by(stretch) {
+        let end = (start + stretch).min(last);
+        let at_end = if end > start { near(end) } else { Near::new() };
+        let lines_near = lines_of(&at_start, &at_end);
+        let of_stretch = start..(start + stretch).min(last + 1);
+        let samples = lane.samples[of_stretch.clone()].iter().zip(&shared[of_stretch]);
+        for (sample, (own, (place, direction))) in samples.enumerate() {
+            let variance = own.lateral_variance_m2 + ALIGNMENT_SIGMA_M.powi(2);
+            for beside in &lines_near {
+                let Some(foot) = foot_on(lines, beside.line, beside.guess(sample, end - start), place) else {
+                    continue;
+                };
+                let heading = direction.xy();
+                let parallel = heading.dot(&foot.tangent).abs() >= LEAST_COSINE * heading.norm() * foot.tangent.norm();
+                let within = foot.across_m.abs() <= params.gate_m && foot.height_m.abs() <= params.gate_height_m;
+                if !parallel || !within || is_taken(beside.line, foot.parameter) {
+                    continue;
+                }
+                let known = agreement.iter().find(|(line, _)| *line == beside.line).map(|(_, cost)| *cost);
+                let of_category = known.unwrap_or_else(|| {
+                    let posterior = lines.lines[beside.line].posterior();
+                    let cost = category_cost(&lane.lane.category_posterior, posterior);
+                    agreement.push((beside.line, cost));
+                    cost
+                });
+                candidates.all.push(Candidate {
+                    line: beside.line,
+                    parameter: foot.parameter,
+                    cost: 0.5 * foot.across_m * foot.across_m / variance + of_category,
+                });
+            }
+            candidates.ends.push(candidates.all.len());
+        }
+        at_start = at_end;
+    }
+    runs(&candidates)
+}
+
+/// A line near a stretch of a lane, with its knots nearest to the ends of the stretch, where it is near them.
+struct NearStretch {
+    line: usize,
+    at_start: Option<usize>,
+    at_end: Option<usize>,
+}
+
+impl NearStretch {
+    /// About where on the line a sample of the stretch lies.
+    fn guess(&self, sample: usize, samples: usize) -> f64 {
+        let share = if samples == 0 { 0.0 } else { sample as f64 / samples as f64 };
+        match (self.at_start, self.at_end) {
+            // A line that comes back to the lane is two in between.
+            (Some(start), Some(end)) if start.abs_diff(end) > 16 => {
+                if share < 0.5 {
+                    start as f64
+                } else {
+                    end as f64
+                }
+            }
+            (Some(start), Some(end)) => start as f64 + (end as f64 - start as f64) * share,
+            (Some(knot), None) | (None, Some(knot)) => knot as f64,
+            (None, None) => 0.0,
+        }
+    }
+}
+
+/// The lines near either end of a stretch, in their order.
+fn lines_of(at_start: &[(usize, usize)], at_end: &[(usize, usize)]) -> Vec<NearStretch> {
+    let mut lines: Vec<NearStretch> =
+        at_start.iter().map(|(line, knot)| NearStretch { line: *line, at_start: Some(*knot), at_end: None }).collect();
+    for (line, knot) in at_end {
+        match lines.iter_mut().find(|near| near.line == *line) {
+            Some(near) => near.at_end = Some(*knot),
+            None => lines.push(NearStretch { line: *line, at_start: None, at_end: Some(*knot) }),
+        }
+    }
+    lines.sort_unstable_by_key(|near| near.line);
+    lines
 }
 
 /// Runs of all lanes of a pass. Where two lanes want one stretch of a line, the one that fits better has it.
@@ -139,14 +218,24 @@ impl Run {
     }
 }
 
-/// Foot point of a place on a line: parameter, distance across (to the left), height above.
-pub(super) fn offset_from(lines: &Lines, line: usize, knot: usize, place: &Point3<f64>) -> Option<(f64, f64, f64)> {
-    let line = &lines.lines[line];
-    let curve = line.curve()?;
-    let foot = foot_point_refined(&curve, place, knot as f64)?;
-    let offset = place - curve.point(foot.parameter);
-    let normal = normal_of(&curve.derivative(foot.parameter));
-    Some((foot.parameter, offset.xy().dot(&normal), offset.z))
+/// Where a place lies beside a line.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Foot {
+    pub(super) parameter: f64,
+    /// To the left of the line, metres.
+    pub(super) across_m: f64,
+    /// Above the line, metres.
+    pub(super) height_m: f64,
+    /// Along the line, horizontally.
+    pub(super) tangent: Vector2<f64>,
+}
+
+/// Foot point of a place on a line, looked for from a parameter on.
+pub(super) fn foot_on(lines: &Lines, line: usize, start: f64, place: &Point3<f64>) -> Option<Foot> {
+    let curve = lines.lines[line].curve()?;
+    let FootOffset { parameter, offset, derivative } = foot_offset(&curve, place, start)?;
+    let across_m = offset.xy().dot(&normal_of(&derivative));
+    Some(Foot { parameter, across_m, height_m: offset.z, tangent: derivative.xy() })
 }
 
 /// Minus the logarithm of the probability that two witnesses of one line name these categories, at most 2.
@@ -159,35 +248,44 @@ fn category_cost(a: &[f64], b: &[f64]) -> f64 {
     -(FLOOR + (1.0 - FLOOR) * same.min(1.0)).ln()
 }
 
-/// The cheapest way through the candidates, as runs.
-fn runs(candidates: &[Vec<Candidate>]) -> Vec<Run> {
-    // States of a sample: its candidates, then none.
-    let mut costs: Vec<Vec<f64>> = Vec::with_capacity(candidates.len());
-    let mut from: Vec<Vec<usize>> = Vec::with_capacity(candidates.len());
-    for (index, now) in candidates.iter().enumerate() {
-        let own = |state: usize| now.get(state).map_or(NONE, |candidate| candidate.cost);
-        if index == 0 {
-            costs.push((0..=now.len()).map(own).collect());
-            from.push(vec![0; now.len() + 1]);
-            continue;
-        }
-        let (before, before_costs) = (&candidates[index - 1], &costs[index - 1]);
-        let best = (0..=now.len()).map(|state| {
-            let reach = (0..=before.len())
-                .map(|previous| (before_costs[previous] + change(before.get(previous), now.get(state)), previous));
-            let (cost, previous) = reach.min_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0));
-            (cost + own(state), previous)
-        });
-        let (cost, previous): (Vec<f64>, Vec<usize>) = best.unzip();
-        costs.push(cost);
-        from.push(previous);
+impl Candidates {
+    fn of(&self, sample: usize) -> &[Candidate] {
+        let start = sample.checked_sub(1).map_or(0, |before| self.ends[before]);
+        &self.all[start..self.ends[sample]]
     }
-    let Some(last) = costs.last() else { return Vec::new() };
-    let mut state = (0..last.len()).min_by(|a, b| last[*a].total_cmp(&last[*b])).unwrap_or(0);
-    let mut path = vec![0; candidates.len()];
-    for index in (0..candidates.len()).rev() {
-        path[index] = state;
-        state = from[index][state];
+}
+
+/// The cheapest way through the candidates, as runs.
+fn runs(candidates: &Candidates) -> Vec<Run> {
+    let samples = candidates.ends.len();
+    // States of a sample: its candidates, then none. Those of all samples stand one after the other.
+    let first_of = |sample: usize| sample + sample.checked_sub(1).map_or(0, |before| candidates.ends[before]);
+    let states = candidates.all.len() + samples;
+    let (mut costs, mut from) = (Vec::with_capacity(states), Vec::with_capacity(states));
+    for sample in 0..samples {
+        let now = candidates.of(sample);
+        let own = |state: usize| now.get(state).map_or(NONE, |candidate| candidate.cost);
+        let Some(earlier) = sample.checked_sub(1) else {
+            costs.extend((0..=now.len()).map(own));
+            from.resize(costs.len(), 0);
+            continue;
+        };
+        let (before, first) = (candidates.of(earlier), first_of(earlier));
+        for state in 0..=now.len() {
+            let reach = (0..=before.len())
+                .map(|previous| (costs[first + previous] + change(before.get(previous), now.get(state)), previous));
+            let (cost, previous) = reach.min_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0));
+            costs.push(cost + own(state));
+            from.push(previous);
+        }
+    }
+    let Some(last) = samples.checked_sub(1) else { return Vec::new() };
+    let at_end = &costs[first_of(last)..];
+    let mut state = (0..at_end.len()).min_by(|a, b| at_end[*a].total_cmp(&at_end[*b])).unwrap_or(0);
+    let mut path = vec![0; samples];
+    for sample in (0..samples).rev() {
+        path[sample] = state;
+        state = from[first_of(sample) + state];
     }
     collect_runs(candidates, &path)
 }
@@ -203,11 +301,11 @@ fn change(before: Option<&Candidate>, now: Option<&Candidate>) -> f64 {
     }
 }
 
-fn collect_runs(candidates: &[Vec<Candidate>], path: &[usize]) -> Vec<Run> {
+fn collect_runs(candidates: &Candidates, path: &[usize]) -> Vec<Run> {
     let mut runs: Vec<Run> = Vec::new();
     let mut open: Option<Run> = None;
-    for (index, (now, state)) in candidates.iter().zip(path).enumerate() {
-        let chosen = now.get(*state);
+    for (index, state) in path.iter().enumerate() {
+        let chosen = candidates.of(index).get(*state);
         let goes_on = match (&open, chosen) {
             (Some(run), Some(chosen)) => {
                 let last = run.parameters[run.parameters.len() - 1];

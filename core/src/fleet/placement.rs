@@ -26,7 +26,7 @@ use super::{
     alignment::{Sighting, Target},
     correction::Correction,
     line::Lines,
-    matching::offset_from,
+    matching::foot_on,
     params::FleetParams,
     prepared::{LaneSample, PreparedLane, PreparedPass, count_of, normal_of},
     ways::Ways,
@@ -169,15 +169,15 @@ fn votes<'a>(lanes: &'a [PreparedLane<'_>], correction: &Correction, lines: &Lin
             let place = correction.apply(&sample.map, sample.arc_m);
             let normal = normal_of(&correction.turn(&sample.tangent, sample.arc_m));
             let beside = lines.near(&place, reach_m + 2.0).into_iter().filter_map(|(line, knot)| {
-                let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
+                let foot = foot_on(lines, line, knot as f64, &place)?;
                 let cosine = normal_of(&lines.lines[line].tangent(knot)).dot(&normal);
-                (cosine.abs() > 0.9 && height_m.abs() < 8.0).then(|| {
+                (cosine.abs() > 0.9 && foot.height_m.abs() < 8.0).then(|| {
                     let agreement = agreement(&lane.lane.category_posterior, lines.lines[line].posterior());
                     Beside {
                         line,
-                        parameter,
-                        move_m: -across_m * cosine.signum(),
-                        above_m: height_m,
+                        parameter: foot.parameter,
+                        move_m: -foot.across_m * cosine.signum(),
+                        above_m: foot.height_m,
                         agreement,
                         log_agreement: agreement.ln(),
                     }

@@ -59,7 +59,7 @@ impl Fusion<'_> {
             lanes.extend(pieces.map(|(stretch, knots)| self.fused_lane(index, stretch, &points[knots], &record)));
         }
         lanes.sort_by_key(|lane| lane.id);
-        let changes = self.changes(&beliefs);
+        let changes = self.changes(&beliefs, &self.paints());
         let drives = self.drives.iter().zip(&self.placed).zip(self.corrections).map(|((drive, placed), correction)| {
             FusedDrive { drive: drive.contribution.drive, correction: placed.then_some(correction) }
         });

@@ -107,10 +107,12 @@ impl JointEquations {
             // Rows mostly come in the order of the stations.
             match tied.last_mut() {
                 Some((station, sum)) if *station == high => *sum += value,
-                Some((station, _)) if *station > high => match tied.binary_search_by_key(&high, |(station, _)| *station) {
-                    Ok(at) => tied[at].1 += value,
-                    Err(at) => tied.insert(at, (high, value)),
-                },
+                Some((station, _)) if *station > high => {
+                    match tied.binary_search_by_key(&high, |(station, _)| *station) {
+                        Ok(at) => tied[at].1 += value,
+                        Err(at) => tied.insert(at, (high, value)),
+                    }
+                }
                 _ => tied.push((high, value)),
             }
         } else {

@@ -9,7 +9,7 @@
 //! with the curvature term left out where it would make the denominator small. Not guaranteed: the global minimum on a curve that doubles back within
 //! a few chords of the start.
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 use super::curve::{ControlPolygon, Curve};
 
@@ -77,6 +77,28 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
     query: &Point3<f64>,
     start: f64,
 ) -> Option<FootPoint> {
+    let FootOffset { parameter, offset, .. } = foot_offset(curve, query, start)?;
+    Some(FootPoint { parameter, distance_m: offset.norm() })
+}
+
+/// Where a query lies from its foot point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FootOffset {
+    /// Curve parameter of the foot point: control point `i` lies at `i`.
+    pub parameter: f64,
+    /// From the foot point to the query, metres.
+    pub offset: Vector3<f64>,
+    /// First derivative of the curve there, metres per control point.
+    pub derivative: Vector3<f64>,
+}
+
+/// As [`foot_point_refined`], with the offset from the curve and the curve's direction there, good to the last step.
+#[must_use]
+pub fn foot_offset<P: ControlPolygon + ?Sized>(
+    curve: &Curve<'_, P>,
+    query: &Point3<f64>,
+    start: f64,
+) -> Option<FootOffset> {
     const ITERATIONS: usize = 12;
     /// A step shorter than this is the last, control points.
     const SETTLED: f64 = 1e-3;
@@ -85,14 +107,14 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
     let (first, last) = (curve.first_parameter(), curve.last_parameter());
     let mut parameter = start.clamp(first, last);
     let mut segment = curve.segment_at(parameter);
-    let mut nearest = *query;
+    let mut found = FootOffset { parameter, offset: Vector3::zeros(), derivative: Vector3::zeros() };
     for _ in 0..ITERATIONS {
         if !segment.holds(parameter) {
             segment = curve.segment_at(parameter);
         }
         let (point, derivative, bend) = segment.evaluate(parameter);
-        nearest = point;
         let offset = query - point;
+        found = FootOffset { parameter, offset, derivative };
         let speed_squared = derivative.norm_squared();
         if speed_squared < 1e-12 {
             return None;
@@ -106,11 +128,11 @@ pub fn foot_point_refined<P: ControlPolygon + ?Sized>(
         let next = parameter + step;
         parameter = next.clamp(first, last);
         if step.abs() < SETTLED && parameter.to_bits() == next.to_bits() {
-            nearest = point + derivative * step;
+            found.offset = query - (point + derivative * step);
             break;
         }
     }
-    Some(FootPoint { parameter, distance_m: (query - nearest).norm() })
+    Some(FootOffset { parameter, ..found })
 }
 
 #[cfg(test)]
@@ -134,7 +156,7 @@ mod tests {
             let points = bend();
             let curve = Curve::new(points.as_slice(), EndRule::Reflected).unwrap();
             let tangent = curve.derivative(along).normalize();
-            let query = curve.point(along) + nalgebra::Vector3::new(-tangent.y, tangent.x, 0.3) * side;
+            let query = curve.point(along) + Vector3::new(-tangent.y, tangent.x, 0.3) * side;
             let found = foot_point_refined(&curve, &query, start).unwrap();
             let dense = (0..19_000).map(|k| (curve.point(f64::from(k) * 1e-3) - query).norm()).fold(f64::INFINITY, f64::min);
             prop_assert!(found.distance_m < dense + 1e-6);
@@ -145,7 +167,7 @@ mod tests {
     fn the_coarse_foot_point_lies_within_centimetres_of_the_refined_one() {
         let points = bend();
         let curve = Curve::new(points.as_slice(), EndRule::Open).unwrap();
-        let query = curve.point(7.3) + nalgebra::Vector3::new(0.2, -0.4, 0.1);
+        let query = curve.point(7.3) + Vector3::new(0.2, -0.4, 0.1);
         let coarse = foot_point_coarse(&curve, &query, 7, 3.0).unwrap();
         let refined = foot_point_refined(&curve, &query, 7.0).unwrap();
         assert!((coarse.parameter - refined.parameter).abs() < 0.02);

@@ -17,7 +17,7 @@ mod wire;
 use std::collections::BTreeSet;
 
 use lanemap_core::{
-    TimestampNs,
+    Category, TimestampNs,
     fleet::{CellId, ChangeKind, FusedLaneId, FusedMap, MapChange},
 };
 use lanemap_proto::{encode, v1};
@@ -60,16 +60,21 @@ pub enum EventKind {
     Merged,
     /// A line is several lines.
     Split,
+    /// A line is painted otherwise.
+    Repainted {
+        /// Code of its category before.
+        from: i32,
+    },
 }
 
 /// The names of all kinds.
-pub const EVENT_KINDS: [&str; 6] = ["appeared", "vanished", "moved", "renamed", "merged", "split"];
+pub const EVENT_KINDS: [&str; 7] = ["appeared", "vanished", "moved", "repainted", "renamed", "merged", "split"];
 
 impl EventKind {
     /// Whether it happened to the road, and not to names alone.
     #[must_use]
     pub fn is_of_road(self) -> bool {
-        matches!(self, Self::Appeared | Self::Vanished | Self::Moved { .. })
+        matches!(self, Self::Appeared | Self::Vanished | Self::Moved { .. } | Self::Repainted { .. })
     }
 
     /// Its name, as readers are told it.
@@ -82,11 +87,16 @@ impl EventKind {
             Self::Renamed => "renamed",
             Self::Merged => "merged",
             Self::Split => "split",
+            Self::Repainted { .. } => "repainted",
         }
     }
 
     fn is_same_kind(self, other: Self) -> bool {
-        std::mem::discriminant(&self) == std::mem::discriminant(&other)
+        match (self, other) {
+            // Dashed that became solid, and solid that became dashed again, are two events.
+            (Self::Repainted { from }, Self::Repainted { from: other }) => from == other,
+            _ => std::mem::discriminant(&self) == std::mem::discriminant(&other),
+        }
     }
 }
 
@@ -109,7 +119,7 @@ pub struct CellEvent {
     pub lane: String,
     /// What bears its paint now, where its name went.
     pub into: Vec<String>,
-    /// Code of the line's category.
+    /// Code of the line's category; where it was repainted, that of the stretch since then.
     pub category: i32,
     /// Probability that it happened, thousandths.
     pub probability_permille: u32,
@@ -263,6 +273,7 @@ impl<'a> Believed<'a> {
             ChangeKind::Appeared => EventKind::Appeared,
             ChangeKind::Vanished => EventKind::Vanished,
             ChangeKind::Moved { by_m } => EventKind::Moved { by_mm: thousandths(by_m) },
+            ChangeKind::Repainted { from, .. } => EventKind::Repainted { from: encode::category(from).into() },
         };
         Self { change, kind, line: whole(change.lane) }
     }
@@ -275,6 +286,14 @@ impl<'a> Believed<'a> {
         let may_be_same = matches!(self.kind, EventKind::Moved { .. });
         (is_same_kind && is_its_line && place::is_same(&self.change.points, &old.points, NEAR_M))
             || (!is_same_kind && may_be_same && place::is_same(&self.change.points, &old.points, NEAR_MOVED_M))
+    }
+
+    /// What its stretch is painted as since it was repainted.
+    fn repainted_to(&self) -> Option<Category> {
+        match self.change.kind {
+            ChangeKind::Repainted { to, .. } => Some(to),
+            _ => None,
+        }
     }
 
     fn event(&self, known: &Known<'_>, fused: &FusedMap) -> CellEvent {
@@ -302,10 +321,13 @@ impl<'a> Believed<'a> {
             published_ms: 0,
             kind: self.kind,
             withdrawn: false,
-            category: fused_lane
-                .map(|lane| encode::category(lane.category).into())
-                .or(earlier_lane.map(|lane| lane.category))
-                .unwrap_or_default(),
+            category: self.repainted_to().map_or_else(
+                || {
+                    let now = fused_lane.map(|lane| encode::category(lane.category).into());
+                    now.or(earlier_lane.map(|lane| lane.category)).unwrap_or_default()
+                },
+                |to| encode::category(to).into(),
+            ),
             drives: fused_lane.map(|lane| lane.drives).or(earlier_lane.map(|lane| lane.drives)).unwrap_or_default(),
             lane: text,
             into: Vec::new(),
@@ -482,6 +504,20 @@ mod tests {
         teller.tell(vec![vanished(1, 0.0, 10)]);
         let back = teller.tell(vec![change(ChangeKind::Appeared, 1, (0.0, 0.1), 10, 99)]);
         assert_eq!(numbers(&back), [(2, false)]);
+        assert!(teller.events.iter().all(|event| !event.withdrawn));
+    }
+
+    #[test]
+    fn a_stretch_that_is_repainted_and_repainted_again_is_two_events() {
+        let (dashed, solid) = (Category::WhiteDashed, Category::WhiteSolid);
+        let repainted = |from, to, noticed| change(ChangeKind::Repainted { from, to }, 1, (0.0, 0.0), 10, noticed);
+        let mut teller = Teller::default();
+        let first = teller.tell(vec![repainted(dashed, solid, 77)]);
+        let code = |category| i32::from(encode::category(category));
+        assert_eq!((first[0].kind, first[0].category), (EventKind::Repainted { from: code(dashed) }, code(solid)));
+        assert_eq!(teller.tell(vec![repainted(dashed, solid, 77)]), []);
+        let again = teller.tell(vec![repainted(solid, dashed, 99)]);
+        assert_eq!(numbers(&again), [(2, false)]);
         assert!(teller.events.iter().all(|event| !event.withdrawn));
     }
 

@@ -72,7 +72,11 @@ struct EventProperties {
     /// How far it moved, metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     moved_m: Option<f64>,
+    /// Where it was repainted, that of the stretch since then.
     category: &'static str,
+    /// What it was before it was repainted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    category_before: Option<&'static str>,
     /// Probability that it happened.
     probability: f64,
     /// Start of the drive that was the last to be needed to believe it.
@@ -135,8 +139,10 @@ pub(super) fn places(cell: CellId, event: &CellEvent) -> Vec<Coordinate> {
 
 /// An event as a feature.
 pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
-    let code = u8::try_from(event.category).unwrap_or_default();
-    let category = category_name(Category::from_openlane_code(code).unwrap_or_default());
+    let named = |code: i32| {
+        let code = u8::try_from(code).unwrap_or_default();
+        category_name(Category::from_openlane_code(code).unwrap_or_default())
+    };
     let id = format!("{cell}.event.{}", event.number);
     let coordinates = places(cell, &event);
     let told_at = i64::try_from(event.published_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
@@ -153,7 +159,11 @@ pub(super) fn feature(cell: CellId, event: CellEvent) -> EventFeature {
             EventKind::Moved { by_mm } => Some(f64::from(by_mm) / 1e3),
             _ => None,
         },
-        category,
+        category: named(event.category),
+        category_before: match event.kind {
+            EventKind::Repainted { from } => Some(named(from)),
+            _ => None,
+        },
         probability: f64::from(event.probability_permille) / 1e3,
         noticed: event.noticed_unix_ns.map(|noticed| rfc3339(TimestampNs(noticed))),
         drives: event.drives,

@@ -46,8 +46,8 @@ pub struct FleetArgs {
     /// Share of a simulated fleet's drives whose lanes all lie one lane off
     #[arg(long, value_name = "P", default_value_t = 0.0, value_parser = share)]
     adversarial: f64,
-    /// Changes of the road that a simulated fleet drives over: so many stretches of line that vanish, that appear and that
-    /// move, between a quarter and three quarters of the drives
+    /// Changes of the road that a simulated fleet drives over: so many stretches of line that vanish, that appear, that
+    /// move and that are repainted, between a quarter and three quarters of the drives
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1000))]
     changes: u32,
     /// Other vehicles as in a town, which hide parts of the road; changes that are reported are scored, too

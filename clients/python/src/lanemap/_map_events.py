@@ -16,13 +16,14 @@ class MapEvent:
 
     id: str
     kind: str
-    """To the road: appeared, vanished, moved; to names of lines: renamed, merged, split. A newer service may tell more."""
+    """To the road: appeared, vanished, moved, repainted; to names of lines: renamed, merged, split. A newer service may tell more."""
     cell: str
     lane: str
     """The line, by its name; where it moved, the new one."""
     into: tuple[str, ...]
     """Names of the lines that bear its paint now, where its name went."""
     category: Category
+    """Of the line; where it was repainted, of the stretch since then."""
     probability: float
     """That it happened, in [0, 1]."""
     withdrawn: bool
@@ -33,6 +34,8 @@ class MapEvent:
     """Drives that saw the line."""
     moved_m: float | None
     """How far it moved, metres."""
+    category_before: Category | None
+    """What it was before it was repainted."""
     revision: int
     """The revision of the map that told of it last."""
     version: int
@@ -88,6 +91,7 @@ def event_of(feature: dict[str, Any]) -> MapEvent:
         noticed=known.get("noticed"),
         drives=known["drives"],
         moved_m=known.get("moved_m"),
+        category_before=Category[known["category_before"].upper()] if "category_before" in known else None,
         revision=known["revision"],
         version=known["version"],
         told_at=known["told_at"],

@@ -1,6 +1,6 @@
 //! The search for the most probable shifts: one per window of the way, on a square of steps.
 
-use std::f64::consts::PI;
+use std::{collections::BTreeMap, f64::consts::PI};
 
 use nalgebra::Vector2;
 
@@ -104,26 +104,33 @@ fn likelihoods(
     let shifts: Vec<Vector2<f64>> = (0..square.count()).map(|state| square.shift(state)).collect();
     let farthest_m = square.side as f64 * STEP_M * 2.0_f64.sqrt();
     let half = count_of(farthest_m / FINE_M) + 1;
-    let mut windows: Vec<Likelihood> = vec![Vec::new(); windows];
-    let mut table = vec![0.0; 2 * half + 1];
-    let mut add = |window: &mut Likelihood, normal: &Vector2<f64>, support: &dyn Fn(f64) -> f64| {
-        for (step, value) in table.iter_mut().enumerate() {
-            *value = support((step as f64 - half as f64) * FINE_M);
+    let steps = || (0..=2 * half).map(|step| (step as f64 - half as f64) * FINE_M);
+    // Samples of one window whose lanes run alike vote alike: their support is summed before it is asked for at each shift.
+    let mut alike: BTreeMap<(usize, i64), (Vector2<f64>, Vec<f64>)> = BTreeMap::new();
+    for vote in votes {
+        let of_direction = || (vote.normal, vec![0.0; 2 * half + 1]);
+        let (_, table) = alike.entry((vote.window, direction(&vote.normal))).or_insert_with(of_direction);
+        for (sum, move_m) in table.iter_mut().zip(steps()) {
+            *sum += share * support(vote, move_m);
         }
+    }
+    let mut windows: Vec<Likelihood> = vec![Vec::new(); windows];
+    let add = |window: &mut Likelihood, normal: &Vector2<f64>, table: &[f64]| {
         for (sum, shift) in window.iter_mut().zip(&shifts) {
             *sum += table[count_of(normal.dot(shift) / FINE_M + half as f64 + 0.5)];
         }
     };
-    for vote in votes {
-        let window = &mut windows[vote.window];
+    for ((window, _), (normal, table)) in &alike {
+        let window = &mut windows[*window];
         window.resize(square.count(), 0.0);
-        add(window, &vote.normal, &|move_m| share * support(vote, move_m));
+        add(window, normal, table);
     }
     // Where no line is, nothing is placed.
     for meeting in meetings {
         let window = windows.get_mut(count_of(meeting.arc_m / WINDOW_M)).filter(|window| !window.is_empty());
         if let Some(window) = window {
-            add(window, &meeting.normal, &|move_m| meeting.support(move_m, WINDOW_M));
+            let table: Vec<f64> = steps().map(|move_m| meeting.support(move_m, WINDOW_M)).collect();
+            add(window, &meeting.normal, &table);
         }
     }
     let occupied = windows.iter().filter(|window| !window.is_empty()).count().max(1) as f64;
@@ -133,6 +140,13 @@ fn likelihoods(
         }
     }
     windows
+}
+
+/// A direction to within half a degree.
+#[expect(clippy::cast_possible_truncation, reason = "an angle, in steps")]
+fn direction(normal: &Vector2<f64>) -> i64 {
+    const STEPS_PER_RADIAN: f64 = 128.0;
+    (normal.y.atan2(normal.x) * STEPS_PER_RADIAN).round() as i64
 }
 
 /// The most probable state of each window.

@@ -28,6 +28,10 @@ impl CellEvent {
                 _ => 0,
             },
             xyz_mm: self.xyz_mm.clone(),
+            category_before: match self.kind {
+                EventKind::Repainted { from } => from,
+                _ => 0,
+            },
         }
     }
 }
@@ -40,5 +44,6 @@ fn kind(kind: EventKind) -> v1::MapEventKind {
         EventKind::Renamed => v1::MapEventKind::Renamed,
         EventKind::Merged => v1::MapEventKind::Merged,
         EventKind::Split => v1::MapEventKind::Split,
+        EventKind::Repainted { .. } => v1::MapEventKind::Repainted,
     }
 }

@@ -230,7 +230,7 @@ fn cell_event() -> Value {
         "withdrawn": { "type": "boolean" }, "lane": text(), "category": text(), "probability": probability(),
         "drives": count(),
     });
-    let optional = json!({ "into": list(&text()), "moved_m": number(), "noticed": time() });
+    let optional = json!({ "into": list(&text()), "moved_m": number(), "category_before": text(), "noticed": time() });
     let mut place = geometry("LineString", &line());
     place["nullable"] = json!(true);
     feature(&place, &object(properties, optional))

@@ -42,10 +42,10 @@ fn scenario(args: &FleetArgs, kind: SimulatedFleet, most: Option<u32>) -> FleetS
     }
 }
 
-/// So many stretches of line that vanish, appear and move, in the middle half of the drives.
+/// So many stretches of line that vanish, appear, move and are repainted, in the middle half of the drives.
 fn changes(each: u32, drives: u32) -> ChangePlan {
     let middle = ChangePlan::some(drives / 4, 3 * drives / 4);
-    ChangePlan { vanished: each, appeared: each, moved: each, repainted: 0, zones: 0, ..middle }
+    ChangePlan { vanished: each, appeared: each, moved: each, repainted: each, zones: 0, ..middle }
 }
 
 fn world(kind: SimulatedFleet, seed: u64, fleet: &Fleet, asked: bool) -> anyhow::Result<Road> {

@@ -4,8 +4,8 @@
 //! their way, at most [`IN_VIEW_M`] to the side: farther out the simulated detector misses most of what is there. Where a line
 //! moved, the ends at which it leaves its old course, by less than [`LEAST_MOVE_M`], are not asked for.
 
-use lanemap_core::{TimestampNs, evaluation::TrueChange};
-use lanemap_simulator::fleet::{Fleet, RoadChange};
+use lanemap_core::{Category, TimestampNs, evaluation::TrueChange};
+use lanemap_simulator::fleet::{ChangeKind, Fleet, RoadChange};
 use nalgebra::Point3;
 
 /// Drives that must have passed a place before the change, and since.
@@ -26,6 +26,9 @@ pub struct SeenChange {
     time: TimestampNs,
     went: Vec<SeenPlace>,
     came: Vec<SeenPlace>,
+    repainted: Vec<SeenPlace>,
+    /// What the repainted places are now.
+    category: Category,
 }
 
 struct SeenPlace {
@@ -57,7 +60,19 @@ impl SeenChange {
             });
             seen.collect()
         };
-        Self { time: change.time, went: seen(&change.before, &change.after), came: seen(&change.after, &change.before) }
+        let time = change.time;
+        match change.kind {
+            ChangeKind::Repainted { to, .. } => {
+                Self { time, went: Vec::new(), came: Vec::new(), repainted: seen(&change.after, &[]), category: to }
+            }
+            _ => Self {
+                time,
+                went: seen(&change.before, &change.after),
+                came: seen(&change.after, &change.before),
+                repainted: Vec::new(),
+                category: Category::Unknown,
+            },
+        }
     }
 
     /// The change as the drives up to `over` could tell it: what is asked for, and the rest. `None` if it is still to come.
@@ -71,10 +86,11 @@ impl SeenChange {
             let of = |places: &[SeenPlace]| {
                 places.iter().filter(|seen| is_asked(seen) == asked).map(|seen| seen.place).collect::<Vec<_>>()
             };
-            let all = self.went.iter().chain(&self.came).filter(|seen| is_asked(seen) == asked);
+            let all = self.went.iter().chain(&self.came).chain(&self.repainted).filter(|seen| is_asked(seen) == asked);
             let all: Vec<&SeenPlace> = all.collect();
             let in_view = all.get(all.len() / 2).map_or_else(Vec::new, |middle| middle.in_view.clone());
-            TrueChange { time: self.time, went: of(&self.went), came: of(&self.came), in_view, asked }
+            let repainted = (of(&self.repainted), self.category);
+            TrueChange { time: self.time, went: of(&self.went), came: of(&self.came), repainted, in_view, asked }
         };
         (self.time < over).then(|| [part(true), part(false)])
     }

@@ -1,0 +1,72 @@
+//! What it costs to fuse a cell: all of its drives anew, and the younger ones onto what is left of the older.
+//!
+//! `cargo bench -p lanemap-simulator --bench fusing`
+
+#![allow(missing_docs, clippy::expect_used)] // criterion's macros; a benchmark that cannot set up must stop
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use lanemap_core::{
+    Mapper, Params, Preset,
+    fleet::{
+        Base, CellId, Contribution, DriveId, FleetParams, Trace, by_seniority, cell::cut, fold, fuse, fuse_onto,
+        split_to_fold,
+    },
+    geometry::{Pose, georeference::Georeference},
+};
+use lanemap_simulator::{
+    Seed,
+    fleet::{Fleet, FleetDrive, FleetScenario},
+};
+
+const DRIVES: [u32; 2] = [10, 50];
+
+/// What a drive says of its cells.
+fn contributions(drive: &FleetDrive<'_>, fleet: &Fleet) -> Vec<(CellId, Contribution)> {
+    let mut mapper = Mapper::new(Params::preset(Preset::Default), drive.sensor());
+    let mut trace = Trace::default();
+    for frame in drive.frames() {
+        let report = mapper.step(&frame);
+        trace.observe(&frame, &report.map_from_vehicle);
+    }
+    let whole = trace.contribution(DriveId(u64::from(drive.number())), drive.sensor(), &mapper.lane_map());
+    let enu_from_map: Pose = fleet.georeference().enu_from_map * drive.world_from_odometry();
+    cut(&whole.expect("it has frames"), &Georeference { anchor: fleet.georeference().anchor, enu_from_map })
+}
+
+/// The cell of a winding road of 1 km in which most of it lies, with so many drives.
+fn cell(drives: u32) -> (CellId, Vec<Contribution>) {
+    let fleet = FleetScenario { drives, ..FleetScenario::winding_road() }.fleet(Seed(1));
+    let all: Vec<(CellId, Contribution)> = fleet.drives().flat_map(|drive| contributions(&drive, &fleet)).collect();
+    let points_in =
+        |cell: CellId| all.iter().filter(|(of, _)| *of == cell).map(|(_, drive)| drive.trajectory.len()).sum::<usize>();
+    let fullest = all.iter().map(|(cell, _)| *cell).max_by_key(|cell| (points_in(*cell), *cell)).expect("a cell");
+    (fullest, all.into_iter().filter(|(cell, _)| *cell == fullest).map(|(_, drive)| drive).collect())
+}
+
+fn fusing(criterion: &mut Criterion) {
+    let params = FleetParams::default();
+    let mut group = criterion.benchmark_group("fuse");
+    group.sample_size(10);
+    for drives in DRIVES {
+        let (cell, contributions) = cell(drives);
+        let anchor = cell.anchor();
+        group.bench_function(BenchmarkId::new("a_cell_anew", drives), |bencher| {
+            bencher.iter(|| fuse(black_box(&contributions), &anchor, &params));
+        });
+        let ordered = by_seniority(&contributions);
+        let (mut base, mut rest) = (Base::default(), ordered.as_slice());
+        while let Some((oldest, younger)) = split_to_fold(rest, &params) {
+            base = fold(&base, oldest, &anchor, &params);
+            rest = younger;
+        }
+        group.bench_function(BenchmarkId::new("a_cell_onto_its_base", drives), |bencher| {
+            bencher.iter(|| fuse_onto(black_box(&base), rest, &anchor, &params));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, fusing);
+criterion_main!(benches);

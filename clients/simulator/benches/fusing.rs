@@ -57,7 +57,7 @@ fn fusing(criterion: &mut Criterion) {
         });
         let ordered = by_seniority(&contributions);
         let (mut base, mut rest) = (Base::default(), ordered.as_slice());
-        while let Some((oldest, younger)) = split_to_fold(rest, &params) {
+        while let Some((oldest, younger)) = split_to_fold(rest, &anchor, &params) {
             base = fold(&base, oldest, &anchor, &params);
             rest = younger;
         }

@@ -8,6 +8,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use super::{
+    contribution::PlacedBy,
     correction::{Correction, CorrectionKnot},
     fusion::Fusion,
     line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
@@ -103,7 +104,15 @@ impl Base {
         let bias_sigma_m = self.gnss_information.map(|information| information.max(1e-9).powf(-0.5));
         // It has no odometry: nothing asks for its drift.
         let drift_sigma = DriftSigma { scale: 1.0, turn_rad_per_m: 1.0 };
-        Restraints { fixes, bias_sigma_m, stated_sigma_m: 0.0, drift_sigma, steps: Vec::new() }
+        Restraints {
+            fixes,
+            placed_by: PlacedBy::Receiver,
+            bias_sigma_m,
+            place_sigma_m: bias_sigma_m[0],
+            stated_sigma_m: 0.0,
+            drift_sigma,
+            steps: Vec::new(),
+        }
     }
 }
 

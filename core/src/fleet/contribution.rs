@@ -16,6 +16,17 @@ use crate::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct DriveId(pub u64);
 
+/// Whence the fixes of a contribution come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PlacedBy {
+    /// From the vehicle's receiver: they say where the map lies on the earth.
+    #[default]
+    Receiver,
+    /// From the map itself ([`localization`](super::localization)): they say where on it the drive lies, and nothing of
+    /// where the map does.
+    Map,
+}
+
 /// What one drive says about the map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Contribution {
@@ -25,6 +36,8 @@ pub struct Contribution {
     pub started: TimestampNs,
     /// The camera that saw the lanes.
     pub sensor: Sensor,
+    /// Whence its fixes come.
+    pub placed_by: PlacedBy,
     /// The way that the vehicle took, in the order of travel.
     pub trajectory: Vec<TrajectoryPoint>,
     /// Its lanes, in the order of their numbers, map frame of the drive.

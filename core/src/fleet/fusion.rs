@@ -18,7 +18,7 @@ use super::{
     bridging::{Parts, Placement},
     change::MapChange,
     continuity::run_on,
-    contribution::{Contribution, DriveId},
+    contribution::{Contribution, DriveId, PlacedBy},
     correction::Correction,
     crowding::first_crowd,
     georeferenced::UNBOUNDED_M,
@@ -210,7 +210,7 @@ impl<'a> Fusion<'a> {
         let prepared = &self.drives[drive];
         for (index, pass) in prepared.passes.iter().enumerate() {
             let sigma_m =
-                if index == 0 { self.restraints[drive].bias_sigma_m[0] } else { self.params.gnss_bias_sigma_m };
+                if index == 0 { self.restraints[drive].place_sigma_m } else { self.params.gnss_bias_sigma_m };
             match self.lay(drive, pass, sigma_m, is_last_chance) {
                 Placement::Refused if index == 0 => return false,
                 // A later pass that fits nowhere lies where odometry puts it after the one before.
@@ -311,9 +311,11 @@ impl<'a> Fusion<'a> {
     /// Weighs the shape that receivers tell, from the next alignment on, by how far they disagree about it.
     fn learn_receivers(&mut self) {
         let drives = self.restraints.iter().zip(&self.corrections).zip(&self.placed);
-        let placed: Vec<_> = drives.filter(|(_, placed)| **placed).map(|(drive, _)| drive).collect();
+        let placed = drives.filter(|(_, placed)| **placed).map(|(drive, _)| drive);
+        let placed: Vec<_> = placed.filter(|(restraints, _)| restraints.placed_by == PlacedBy::Receiver).collect();
         let Some(share) = learned_shape_share(&placed, self.params) else { return };
-        for (restraints, drive) in self.restraints.iter_mut().zip(self.drives) {
+        let by_receivers = self.restraints.iter_mut().zip(self.drives);
+        for (restraints, drive) in by_receivers.filter(|(own, _)| own.placed_by == PlacedBy::Receiver) {
             restraints.fixes.clone_from(&drive.restraints.fixes);
             restraints.reweigh_shape(share, self.params);
         }

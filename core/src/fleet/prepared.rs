@@ -9,7 +9,7 @@ use std::ops::Range;
 use nalgebra::{Point3, Vector2, Vector3};
 
 use super::{
-    contribution::{Contribution, TrajectoryPoint},
+    contribution::{Contribution, PlacedBy, TrajectoryPoint},
     correction::{Correction, knot_indices},
     georeferenced::by_gnss,
     params::FleetParams,
@@ -24,8 +24,12 @@ use crate::{
 #[derive(Clone, Debug)]
 pub(super) struct Restraints {
     pub(super) fixes: Vec<SharedFix>,
+    /// Whence the fixes come.
+    pub(super) placed_by: PlacedBy,
     /// Standard deviations of what all fixes have in common, horizontally and in height, metres.
     pub(super) bias_sigma_m: [f64; 2],
+    /// Standard deviation of where the fixes put the drive among others, metres.
+    pub(super) place_sigma_m: f64,
     /// Mean of the standard deviations that the receiver states, horizontally, metres.
     pub(super) stated_sigma_m: f64,
     /// What odometry is off by all through the drive.
@@ -108,6 +112,8 @@ pub(super) struct LaneSample {
     pub(super) height_variance_m2: f64,
 }
 
+/// Standard deviation of what is not known, metres.
+const UNKNOWN_M: f64 = 1e3;
 /// Way after which coming near an earlier place is coming back, metres.
 const LEAST_LOOP_M: f64 = 150.0;
 /// Distance from an earlier place that is near, metres.
@@ -116,7 +122,7 @@ const NEAR_M: f64 = 30.0;
 impl<'a> PreparedDrive<'a> {
     pub(super) fn new(contribution: &'a Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
         let trajectory = &contribution.trajectory;
-        let restraints = Restraints::new(trajectory, anchor, params);
+        let restraints = Restraints::new(contribution, anchor, params);
         let by_gnss = by_gnss(trajectory, &restraints, params);
         let passes = passes(&way(trajectory, by_gnss.as_ref()));
         let passes: Vec<&[TrajectoryPoint]> = passes.into_iter().map(|range| &trajectory[range]).collect();
@@ -136,11 +142,19 @@ impl<'a> PreparedDrive<'a> {
 }
 
 impl Restraints {
-    fn new(trajectory: &[TrajectoryPoint], anchor: &Anchor, params: &FleetParams) -> Self {
+    fn new(contribution: &Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
+        let (trajectory, placed_by) = (contribution.trajectory.as_slice(), contribution.placed_by);
         let mut fixes: Vec<SharedFix> = trajectory.iter().filter_map(|point| shared_fix(point, anchor)).collect();
         let mean = |axis: usize| fixes.iter().map(|fix| fix.sigma_m[axis]).sum::<f64>() / fixes.len().max(1) as f64;
         let stated_sigma_m = mean(0);
-        let bias_sigma_m = [0, 1].map(|axis| mean(axis).max(params.gnss_bias_sigma_m));
+        let (bias_sigma_m, place_sigma_m) = match placed_by {
+            PlacedBy::Receiver => {
+                let sigma_m = [0, 1].map(|axis| mean(axis).max(params.gnss_bias_sigma_m));
+                (sigma_m, sigma_m[0])
+            }
+            // They know where the drive lies on the map, and nothing of where the map lies.
+            PlacedBy::Map => ([UNKNOWN_M; 2], mean(0).max(params.gate_m / params.search_sigmas)),
+        };
         // Fixes near each other share what they are off by: so many witnesses there are of the shape of the way.
         let length_m = fixes.last().map_or(0.0, |last| last.arc_m - fixes[0].arc_m);
         let witnesses = length_m / params.gnss_correlation_m + 1.0;
@@ -152,7 +166,7 @@ impl Restraints {
         let steps = knots.windows(2).map(|pair| step(&trajectory[pair[0]..=pair[1]], params)).collect();
         let drift_sigma =
             DriftSigma { scale: params.odometry_scale_sigma, turn_rad_per_m: params.odometry_turn_sigma_rad_per_m };
-        Self { fixes, bias_sigma_m, stated_sigma_m, drift_sigma, steps }
+        Self { fixes, placed_by, bias_sigma_m, place_sigma_m, stated_sigma_m, drift_sigma, steps }
     }
 
     /// Weighs what the fixes say of the shape of the way by another share of what the receiver states.

@@ -73,7 +73,10 @@ mod tests {
     use nalgebra::{Point3, Vector3};
 
     use super::*;
-    use crate::fleet::prepared::{DriftSigma, SharedFix};
+    use crate::fleet::{
+        contribution::PlacedBy,
+        prepared::{DriftSigma, SharedFix},
+    };
 
     /// A drive whose fixes wander about its way by so much, and have a bias of their own.
     fn drive(number: u32, wander_m: f64) -> Restraints {
@@ -90,7 +93,9 @@ mod tests {
         let drift_sigma = DriftSigma { scale: 0.01, turn_rad_per_m: 1e-5 };
         Restraints {
             fixes: fixes.collect(),
+            placed_by: PlacedBy::Receiver,
             bias_sigma_m: [1.5; 2],
+            place_sigma_m: 1.5,
             stated_sigma_m: 1.5,
             drift_sigma,
             steps: Vec::new(),

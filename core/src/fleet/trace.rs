@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::contribution::{Contribution, DriveId, TrajectoryPoint};
+use super::contribution::{Contribution, DriveId, PlacedBy, TrajectoryPoint};
 use crate::{
     frame::{Frame, TimestampNs},
     geometry::{Pose, pose::yaw_rad},
@@ -63,6 +63,7 @@ impl Trace {
     #[must_use]
     pub fn contribution(&self, drive: DriveId, sensor: Sensor, map: &LaneMap) -> Option<Contribution> {
         let started = self.started?;
-        Some(Contribution { drive, started, sensor, trajectory: self.points.clone(), lanes: map.lanes.clone() })
+        let (trajectory, lanes) = (self.points.clone(), map.lanes.clone());
+        Some(Contribution { drive, started, sensor, placed_by: PlacedBy::Receiver, trajectory, lanes })
     }
 }

@@ -3,7 +3,7 @@
 
 use lanemap_core::{
     Category, ControlPoint, EndRule, GnssFix, LaneId, MapLane, Sensor, TimestampNs,
-    fleet::{Contribution, DriveId, TrajectoryPoint},
+    fleet::{Contribution, DriveId, PlacedBy, TrajectoryPoint},
     geometry::georeference::{Anchor, Wgs84},
 };
 use nalgebra::{Matrix3, Point3, Rotation2, Vector2};
@@ -187,6 +187,13 @@ impl<'a> Survey<'a> {
             }
         });
         let lanes = lanes.collect();
-        Contribution { drive: DriveId(number as u64 + 1), started, sensor: Sensor::default(), trajectory, lanes }
+        Contribution {
+            drive: DriveId(number as u64 + 1),
+            started,
+            sensor: Sensor::default(),
+            placed_by: PlacedBy::Receiver,
+            trajectory,
+            lanes,
+        }
     }
 }

@@ -61,6 +61,7 @@ fn without_geometry(contribution: &Contribution) -> Contribution {
         drive: contribution.drive,
         started: contribution.started,
         sensor: contribution.sensor,
+        placed_by: contribution.placed_by,
         trajectory: Vec::new(),
         lanes: Vec::new(),
     }
@@ -140,7 +141,7 @@ mod tests {
     use super::*;
     use crate::{
         category::Category,
-        fleet::contribution::DriveId,
+        fleet::contribution::{DriveId, PlacedBy},
         frame::TimestampNs,
         geometry::Pose,
         lane_map::{ControlPoint, EndRule},
@@ -180,6 +181,7 @@ mod tests {
             drive: DriveId(1),
             started: TimestampNs(0),
             sensor: Sensor::default(),
+            placed_by: PlacedBy::Receiver,
             trajectory: way.iter().enumerate().map(point).collect(),
             lanes: vec![lane],
         };

@@ -9,7 +9,7 @@ use std::{
     time::{SystemTime, UNIX_EPOCH},
 };
 
-use lanemap_core::Frame;
+use lanemap_core::{Frame, fleet::localization::LEAST_WAY_M};
 use lanemap_proto::v1::RefusalReason;
 use tokio::{
     sync::{Mutex as AsyncMutex, OwnedSemaphorePermit, Semaphore, mpsc, oneshot},
@@ -163,8 +163,9 @@ impl SessionRegistry {
             journal.with_frames_after(records.map(|record| (record.id, told.get(&record.id).copied().flatten())))
         };
         let mut unsaved: HashSet<_> = blocking(find).await?.into_iter().collect();
-        let on_earth = listed.iter().filter(|told| told.georeference.is_some());
-        unsaved.extend(on_earth.filter(|told| fuser.is_behind(told.session, told.version)).map(|told| told.session));
+        let may_lie_on_the_map = listed.iter().filter(|told| told.georeference.is_some() || is_sought(told));
+        let behind = may_lie_on_the_map.filter(|told| fuser.is_behind(told.session, told.version));
+        unsaved.extend(behind.map(|told| told.session));
         let slots: Vec<_> = locked(&self.shared.slots).values().map(|place| Arc::clone(&place.slot)).collect();
         for slot in slots {
             let mut slot = slot.lock().await;
@@ -341,11 +342,24 @@ impl SessionRegistry {
 }
 
 impl Shared {
-    fn begin_actor(&self, loaded: Loaded, outbox: Outbox) -> ActorHandle {
+    fn begin_actor(self: &Arc<Self>, loaded: Loaded, outbox: Outbox) -> ActorHandle {
         let (commands, waiting) = mpsc::channel(self.surroundings.config.max_frames_in_flight);
+        let (shared, drive) = (Arc::clone(self), loaded.record.drive);
         let actor =
             Actor::new(self.surroundings.clone(), loaded, waiting, self.actors.clone(), self.mapping_turns.clone());
-        ActorHandle { commands, outbox, task: self.actors.spawn(actor.run()) }
+        let task = self.actors.spawn(async move {
+            actor.run().await;
+            // A task of its own: who holds the slot waits for this one.
+            let actors = shared.actors.clone();
+            actors.spawn(async move { shared.let_go_of_actor(drive).await });
+        });
+        ActorHandle { commands, outbox, task }
+    }
+
+    /// Lets go of a drive's actor that has left, of its queue and its task: a store holds many drives and few that are awake.
+    async fn let_go_of_actor(&self, drive: DrivePseudonym) {
+        let Some(slot) = locked(&self.slots).get(&drive).map(|place| Arc::clone(&place.slot)) else { return };
+        slot.lock().await.actor.take_if(|actor| actor.commands.is_closed());
     }
 }
 
@@ -459,6 +473,11 @@ pub(super) async fn blocking<T: Send + 'static>(
 
 pub(super) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Whether a drive without GNSS is so long that it was sought on the shared map, or would be.
+fn is_sought(told: &SessionSummary) -> bool {
+    told.extent.is_some_and(|[low, high]| (high - low).xy().norm() >= 2.0 * LEAST_WAY_M)
 }
 
 #[cfg(test)]

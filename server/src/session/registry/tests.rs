@@ -154,6 +154,21 @@ async fn a_vehicle_that_comes_back_after_a_crash_is_heard_before_its_frames_are_
     assert_eq!(sessions.get(&session).unwrap().version.0, 301);
 }
 
+#[tokio::test]
+async fn nothing_of_an_actor_is_kept_once_its_drive_is_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let registry = registry(folder.path(), ServerConfig::default()).await;
+    let (outbox, mut answers) = Outbox::new();
+    let attachment = registry.open(&start(), &outbox).await.unwrap();
+    attachment.send_frame(frame(1), Instant::now()).await.unwrap();
+    assert_eq!(next(&mut answers).await, Message::Ack(v1::Ack { acked_sequence_inclusive: 1 }));
+    attachment.send(|stream| Command::End { stream }).await.unwrap();
+    registry.stopped().await;
+    let slot = locked(&registry.shared.slots).values().map(|place| Arc::clone(&place.slot)).next().unwrap();
+    let slot = slot.lock().await;
+    assert!(slot.actor.is_none() && slot.record.is_some());
+}
+
 fn copy_folder(from: &Path, to: &Path) {
     for entry in std::fs::read_dir(from).unwrap() {
         let entry = entry.unwrap();

@@ -18,6 +18,7 @@ mod cell_record;
 pub mod events;
 pub mod follow;
 mod lineage;
+pub mod localizing;
 pub(crate) mod offer;
 pub mod publications;
 mod queue;
@@ -46,11 +47,15 @@ pub use shared_map::{ChangesError, KeptVersion, PublishedCell, SharedMap};
 
 use crate::{
     config::ServerConfig,
-    journal::{JournalError, cells::CellStore},
+    journal::{
+        JournalError,
+        cells::{CellStore, Contributed},
+    },
     session::{MapVersion, SessionId},
 };
 use bases::Bases;
 use cell_record::{FORMAT, fingerprint};
+use localizing::{SearchedMap, Sought};
 use publications::Publications;
 use queue::Queue;
 use worker::Worker;
@@ -65,6 +70,8 @@ pub(crate) struct FuseSettings {
     pub(crate) versions_kept: Duration,
     pub(crate) most_events: usize,
     pub(crate) events_kept: Duration,
+    /// Length of the map's lines up to which drives without GNSS are sought on it, metres.
+    pub(crate) most_searched_m: f64,
 }
 
 impl FuseSettings {
@@ -77,6 +84,7 @@ impl FuseSettings {
             versions_kept: Duration::from_secs(config.cell_versions_kept_s),
             most_events: config.max_events_per_cell,
             events_kept: Duration::from_secs(config.cell_events_kept_s),
+            most_searched_m: 1e3 * config.max_localization_km,
         }
     }
 }
@@ -93,6 +101,8 @@ struct Shared {
     map: SharedMap,
     queue: Mutex<Queue>,
     bases: Bases,
+    /// The map as drives without GNSS are sought on it.
+    searched: Mutex<SearchedMap>,
     /// Told when there is more in the queue, or nothing more will come.
     woken: Condvar,
     /// Drives that a crash interrupted have been asked what they say.
@@ -141,11 +151,18 @@ impl Fuser {
         }
         let publications = Publications::open(store, &records)?;
         map.begin(records, publications, store.clone());
+        for (session, sought) in store.sought::<Sought>()? {
+            if sought.is_none() {
+                queue.locate(session, now);
+            }
+            map.tell_sought(session, Some(sought.unwrap_or_default()));
+        }
         let shared = Shared {
             settings,
             map,
             queue: Mutex::new(queue),
             bases: Bases::new(),
+            searched: Mutex::default(),
             woken: Condvar::new(),
             recovered: AtomicBool::new(false),
             stopping: AtomicBool::new(false),
@@ -165,8 +182,9 @@ impl Fuser {
     /// Begins to fuse cells: drives that a crash interrupted have said what they have to say, so that no cell is fused
     /// without them.
     pub(crate) fn begin(&self) {
-        let queue = self.queue();
+        let mut queue = self.queue();
         self.shared.recovered.store(true, Ordering::Relaxed);
+        self.seek_where_map_grew(&mut queue);
         drop(queue);
         self.shared.woken.notify_all();
     }
@@ -193,10 +211,24 @@ impl Fuser {
 
     /// Fuses the cells to which deleted sessions contributed, now that the store has nothing of them.
     pub(crate) async fn fuse_without(&self, sessions: &[SessionId]) {
+        let map = &self.shared.map;
+        let mut withdrawn = Vec::new();
         let cells: Vec<CellId> = {
             let mut queue = self.queue();
-            let cells: BTreeSet<CellId> =
+            let mut cells: BTreeSet<CellId> =
                 sessions.iter().filter_map(|session| queue.forget(*session)).flat_map(|left| left.cells).collect();
+            for session in sessions {
+                map.tell_sought(*session, None);
+            }
+            // The store has taken those off the map that were found on these cells.
+            for (session, _) in map.all_sought().into_iter().filter(|(_, sought)| sought.is_aligned()) {
+                let lies_on_them = |left: &Contributed| left.cells.iter().any(|cell| cells.contains(cell));
+                if queue.contributed(session).is_some_and(lies_on_them) {
+                    withdrawn.push((session, queue.forget(session).unwrap_or_default().cells));
+                    map.tell_sought(session, Some(Sought::default()));
+                }
+            }
+            cells.extend(withdrawn.iter().flat_map(|(_, left)| left.iter().copied()));
             for cell in &cells {
                 queue.touch_cell(*cell, Instant::now());
             }
@@ -205,6 +237,23 @@ impl Fuser {
         };
         self.shared.woken.notify_all();
         self.wait_until(|queue| cells.iter().all(|cell| !queue.is_dirty(*cell))).await;
+        let mut queue = self.queue();
+        for (session, _) in withdrawn {
+            queue.locate(session, Instant::now());
+        }
+        self.tell_dirty(&queue);
+        drop(queue);
+        self.shared.woken.notify_all();
+    }
+
+    /// Has the drives sought again that were not found on a smaller map.
+    fn seek_where_map_grew(&self, queue: &mut Queue) {
+        let map_m = self.shared.map.line_m();
+        for (session, sought) in self.shared.map.all_sought() {
+            if sought.map_grew(map_m) {
+                queue.locate(session, Instant::now());
+            }
+        }
     }
 
     /// Waits until the queue is as it should be, or nothing is done any more.

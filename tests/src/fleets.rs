@@ -49,6 +49,20 @@ pub fn along_a_road(seed: u64, count: u32, length_m: f64, on_border: bool) -> Ve
     wire_drives(&in_one_place(scenario, seed, on_border))
 }
 
+/// `count` drives, a day apart, of `length_m` along one road that bends to both sides and nowhere twice alike, each with a
+/// GNSS bias of its own.
+#[must_use]
+pub fn along_a_bending_road(seed: u64, count: u32, length_m: f64) -> Vec<WireDrive> {
+    let scenario = FleetScenario {
+        drives: count,
+        roads: FleetRoads::Single(SingleRoad::new(Course::Loop, 2_500.0)),
+        routes: FleetRoutes::Shared { length_m, both_directions: false },
+        receiver: ReceiverModel { bias_sigma_m: 1.0, ..ReceiverModel::default() },
+        ..FleetScenario::straight_road()
+    };
+    wire_drives(&in_one_place(scenario, seed, false))
+}
+
 /// A line on the earth: longitude and latitude of its points, degrees.
 pub type Places = Vec<[f64; 2]>;
 
@@ -124,6 +138,13 @@ fn wire_drives(fleet: &Fleet) -> Vec<WireDrive> {
 }
 
 impl WireDrive {
+    /// The same drive of a vehicle without a receiver.
+    #[must_use]
+    pub fn without_gnss(mut self) -> Self {
+        self.frames.iter_mut().for_each(|frame| frame.gnss = None);
+        self
+    }
+
     /// Uploads the first frames, or all; gives the session's id.
     pub async fn upload(&self, url: &str, frames: usize, end: bool) -> String {
         let mut client = IngestServiceClient::connect(url.to_owned()).await.unwrap();

@@ -119,6 +119,8 @@ pub struct ConfigOverrides {
     pub fuse_cpu_share: Option<f64>,
     /// See [`ServerConfig::max_contributions_per_cell`].
     pub max_contributions_per_cell: Option<usize>,
+    /// See [`ServerConfig::max_localization_km`].
+    pub max_localization_km: Option<f64>,
     /// See [`ServerConfig::cell_versions_kept_s`].
     pub cell_versions_kept_s: Option<u64>,
     /// See [`ServerConfig::max_events_per_cell`].
@@ -215,6 +217,7 @@ impl ConfigOverrides {
         set(&mut settings.fuse_interval_ms, self.fuse_interval_ms);
         set(&mut settings.fuse_cpu_share, self.fuse_cpu_share);
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
+        set(&mut settings.max_localization_km, self.max_localization_km);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);
         set(&mut settings.max_events_per_cell, self.max_events_per_cell);
         set(&mut settings.cell_events_kept_s, self.cell_events_kept_s);

@@ -88,7 +88,7 @@ mod tests {
 
     use lanemap_core::{
         Category, ControlPoint, EndRule, GnssFix, LaneId, MapLane, Sensor, TimestampNs,
-        fleet::{DriveId, TrajectoryPoint, fuse},
+        fleet::{DriveId, PlacedBy, TrajectoryPoint, fuse},
     };
     use nalgebra::{Matrix3, Point3};
 
@@ -139,6 +139,7 @@ mod tests {
             drive: DriveId(number),
             started: TimestampNs(i64::try_from(number).unwrap()),
             sensor: Sensor::default(),
+            placed_by: PlacedBy::Receiver,
             trajectory: trajectory.collect(),
             lanes: vec![lane],
         }

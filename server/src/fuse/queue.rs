@@ -19,6 +19,8 @@ use crate::{journal::cells::Contributed, session::SessionId};
 pub(super) enum Task {
     /// A drive has something to say.
     Contribute(SessionId),
+    /// A drive without GNSS is to be sought on the map, which has grown.
+    Locate(SessionId),
     /// A cell is dirty.
     Fuse(CellId),
 }
@@ -38,6 +40,7 @@ pub(super) enum Wanted {
 #[derive(Debug)]
 pub(super) enum Taken {
     Contribute(Box<Offer>),
+    Locate(SessionId),
     Fuse(CellId),
 }
 
@@ -59,11 +62,21 @@ pub(super) struct Queue {
 const MOST_DONE: usize = 1024;
 
 impl Task {
+    /// What is never done at the same time: the task itself, and what else writes of the same drive.
+    fn same_drive(self) -> Vec<Self> {
+        match self {
+            Self::Contribute(session) | Self::Locate(session) => {
+                vec![Self::Contribute(session), Self::Locate(session)]
+            }
+            Self::Fuse(_) => vec![self],
+        }
+    }
+
     /// Drives come round twice as often as cells, so that they add half an interval to the wait at most.
     fn interval(self, of_cells: Duration) -> Duration {
         match self {
             Self::Contribute(_) => of_cells / 2,
-            Self::Fuse(_) => of_cells,
+            Self::Locate(_) | Self::Fuse(_) => of_cells,
         }
     }
 }
@@ -88,7 +101,7 @@ impl Queue {
             (Some(before), _) => Some(before.version),
             (None, Some(contributed)) => Some(contributed.version),
             // Nothing to say, and nothing to take back.
-            (None, None) if offer.georeference.is_none() => Some(offer.version),
+            (None, None) if !offer.may_be_placed() => Some(offer.version),
             (None, None) => None,
         };
         if said == Some(offer.version) {
@@ -104,6 +117,11 @@ impl Queue {
         self.add(Task::Fuse(cell), now);
     }
 
+    /// A drive without GNSS is to be sought again.
+    pub(super) fn locate(&mut self, session: SessionId, now: Instant) {
+        self.add(Task::Locate(session), now);
+    }
+
     fn add(&mut self, task: Task, now: Instant) {
         if self.waiting.contains_key(&task) {
             return;
@@ -116,7 +134,7 @@ impl Queue {
 
     /// The task that became due first; or when the next one will be, `None` where there is none.
     pub(super) fn take(&mut self, now: Instant, wanted: Wanted) -> Result<Taken, Option<Instant>> {
-        let is_free = |task: &Task| !self.in_work.contains(task);
+        let is_free = |task: &Task| task.same_drive().iter().all(|task| !self.in_work.contains(task));
         let is_wanted = |task: &Task| wanted == Wanted::All || matches!(task, Task::Contribute(_));
         let first = self.due.iter().find(|(_, task)| is_free(task) && is_wanted(task)).copied();
         let Some((at, task)) = first else { return Err(None) };
@@ -126,6 +144,7 @@ impl Queue {
         self.remove(task);
         let taken = match task {
             Task::Contribute(session) => self.offers.remove(&session).map(|offer| Taken::Contribute(Box::new(offer))),
+            Task::Locate(session) => Some(Taken::Locate(session)),
             Task::Fuse(cell) => Some(Taken::Fuse(cell)),
         };
         let Some(taken) = taken else { return self.take(now, wanted) };
@@ -157,6 +176,7 @@ impl Queue {
                 self.offers.entry(session).or_insert(*offer);
                 Task::Contribute(session)
             }
+            Taken::Locate(session) => Task::Locate(session),
             Taken::Fuse(cell) => Task::Fuse(cell),
         };
         self.in_work.remove(&task);
@@ -174,11 +194,14 @@ impl Queue {
         self.contributed.insert(session, contributed);
     }
 
-    /// Drops a session's offer; whether none of it is in work.
+    /// Drops a session's offer, and the search for it; whether none of it is in work.
     pub(super) fn drop_offer(&mut self, session: SessionId) -> bool {
         self.offers.remove(&session);
-        self.remove(Task::Contribute(session));
-        !self.in_work.contains(&Task::Contribute(session))
+        let tasks = [Task::Contribute(session), Task::Locate(session)];
+        for task in tasks {
+            self.remove(task);
+        }
+        tasks.iter().all(|task| !self.in_work.contains(task))
     }
 
     /// Forgets a session; gives what it had contributed.
@@ -196,10 +219,11 @@ impl Queue {
         tasks.filter_map(|task| if let Task::Fuse(cell) = task { Some(*cell) } else { None }).collect()
     }
 
-    /// Drives whose offers are not in the store yet.
+    /// Drives whose offers are not in the store yet, or that are sought.
     pub(super) fn waiting_offers(&self) -> usize {
-        let in_work = self.in_work.iter().filter(|task| matches!(task, Task::Contribute(_))).count();
-        self.offers.len() + in_work
+        let in_work = self.in_work.iter().filter(|task| !matches!(task, Task::Fuse(_))).count();
+        let sought = self.waiting.keys().filter(|task| matches!(task, Task::Locate(_))).count();
+        self.offers.len() + sought + in_work
     }
 }
 

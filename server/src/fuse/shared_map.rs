@@ -21,11 +21,13 @@ use tokio::sync::watch;
 use super::{
     CellRecord, CellVersion,
     events::CellEvent,
+    localizing::{Alignment, Sought},
     publications::{CellChange, MapChanges, MapRevision, Publication, Publications, RevisionError},
     wire::{changes, empty_cell},
 };
 use crate::{
     journal::{JournalError, cells::CellStore},
+    session::SessionId,
     telemetry,
 };
 
@@ -94,6 +96,8 @@ struct Shared {
     last_given: Mutex<MapRevision>,
     store: ArcSwapOption<CellStore>,
     waiting: ArcSwap<Waiting>,
+    /// Where drives without GNSS stand that were sought.
+    sought: RwLock<BTreeMap<SessionId, Sought>>,
     publications: watch::Sender<u64>,
 }
 
@@ -161,6 +165,7 @@ impl SharedMap {
             last_given: Mutex::default(),
             store: ArcSwapOption::empty(),
             waiting: ArcSwap::default(),
+            sought: RwLock::default(),
             publications: watch::Sender::default(),
         };
         Self { shared: Arc::new(shared) }
@@ -266,6 +271,39 @@ impl SharedMap {
     /// A revision that is not kept any more, or not there yet.
     pub fn publications_after(&self, since: MapRevision, most: usize) -> Result<Vec<Publication>, RevisionError> {
         self.at_once(|cells| Ok(cells.publications.after(since)?.take(most).copied().collect()))
+    }
+
+    /// Length of all lines, metres.
+    #[must_use]
+    pub fn line_m(&self) -> f64 {
+        self.at_once(|cells| cells.records.values().map(|record| record.line_m).sum())
+    }
+
+    /// Where a drive without GNSS stands; as a drive of which nothing is known, if it was never sought.
+    #[must_use]
+    pub fn alignment(&self, session: &SessionId) -> Alignment {
+        self.sought(*session).map(|sought| sought.alignment).unwrap_or_default()
+    }
+
+    pub(super) fn sought(&self, session: SessionId) -> Option<Sought> {
+        self.shared.sought.read().unwrap_or_else(PoisonError::into_inner).get(&session).copied()
+    }
+
+    /// Every drive that was sought, in their order.
+    pub(super) fn all_sought(&self) -> Vec<(SessionId, Sought)> {
+        let sought = self.shared.sought.read().unwrap_or_else(PoisonError::into_inner);
+        sought.iter().map(|(session, sought)| (*session, *sought)).collect()
+    }
+
+    /// Tells where a drive stands; nothing of one that has GNSS, or is gone.
+    pub(super) fn tell_sought(&self, session: SessionId, told: Option<Sought>) {
+        let mut sought = self.shared.sought.write().unwrap_or_else(PoisonError::into_inner);
+        match told {
+            Some(told) => sought.insert(session, told),
+            None => sought.remove(&session),
+        };
+        drop(sought);
+        self.count();
     }
 
     fn at_once<T>(&self, read: impl FnOnce(&Cells) -> T) -> T {

@@ -11,6 +11,8 @@
 //! | `cell_purges`       | cell                                   | none: a drive in it was deleted            |
 //! | `publications`      | revision, 8 bytes big-endian           | which version of which cell, postcard      |
 //! | `cell_events`       | cell, then number, 8 bytes big-endian  | what happened in it, postcard              |
+//! | `own_frames`        | session without GNSS                   | all that it says, in its own frame, postcard |
+//! | `sought`            | session without GNSS                   | what came of the search for it, postcard   |
 //!
 //! Contributions are written without waiting for the disk: whatever a crash takes of them, the drives' snapshots and
 //! frames give again. Versions are on the disk before anybody reads them, so that none is ever given twice.
@@ -102,6 +104,22 @@ pub(crate) struct CellWrite {
     pub(crate) purged: bool,
 }
 
+/// What becomes of what is kept of a drive without GNSS.
+#[derive(Clone, Debug)]
+pub(crate) enum OwnFrame {
+    /// There is none, or it stays.
+    Stays,
+    /// The drive has a place on the earth now.
+    Goes,
+    /// It is new, in part.
+    Put {
+        /// All that the drive says, postcard; `None` where that stays.
+        contribution: Option<Vec<u8>>,
+        /// What came of the search for it, postcard; `None` where that stays.
+        sought: Option<Vec<u8>>,
+    },
+}
+
 /// The contributions to one cell, by session.
 pub(crate) type Facts = BTreeMap<SessionId, ContributionFact>;
 
@@ -126,7 +144,8 @@ impl CellStore {
         if store.facts.get(MAP_FORMAT)?.as_deref() == Some(&format.to_be_bytes()) {
             return Ok(());
         }
-        for keyspace in [&store.contributions, &store.contribution_facts, &store.contributed] {
+        let keyspaces = [&store.contributions, &store.contribution_facts, &store.contributed];
+        for keyspace in keyspaces.into_iter().chain([&store.own_frames, &store.sought]) {
             keyspace.clear()?;
         }
         Ok(store.facts.insert(MAP_FORMAT, format.to_be_bytes())?)
@@ -187,6 +206,31 @@ impl CellStore {
                 Ok((session_of(&key)?, decoded("how much was contributed", &value)?))
             })
             .collect()
+    }
+
+    /// How much of one session has been contributed.
+    pub(crate) fn contributed_of(&self, session: SessionId) -> Result<Contributed, JournalError> {
+        let bytes = self.store.get()?.contributed.get(session.to_key())?;
+        bytes.map_or_else(|| Ok(Contributed::default()), |bytes| decoded("how much was contributed", &bytes))
+    }
+
+    /// What came of the search for every drive without GNSS; `None` of one that is to be sought.
+    pub(crate) fn sought<T: DeserializeOwned>(&self) -> Result<Vec<(SessionId, Option<T>)>, JournalError> {
+        let store = self.store.get()?;
+        let sessions = store.own_frames.iter().map(|entry| session_of(&entry.key()?));
+        sessions
+            .map(|session| {
+                let session = session?;
+                let bytes = store.sought.get(session.to_key())?;
+                Ok((session, bytes.and_then(|bytes| postcard::from_bytes(&bytes).ok())))
+            })
+            .collect()
+    }
+
+    /// All that a drive without GNSS says, in its own frame.
+    pub(crate) fn own_frame(&self, session: SessionId) -> Result<Option<Contribution>, JournalError> {
+        let bytes = self.store.get()?.own_frames.get(session.to_key())?;
+        bytes.map(|bytes| decoded("a drive in its own frame", &bytes)).transpose()
     }
 
     /// The cells of which a drive was deleted since they were fused.
@@ -253,6 +297,7 @@ impl CellStore {
         contributed: &Contributed,
         changed: Vec<StoredContribution>,
         left: &[CellId],
+        own_frame: OwnFrame,
     ) -> Result<(), JournalError> {
         self.health.borrow().check()?;
         let store = self.store.get()?;
@@ -266,6 +311,20 @@ impl CellStore {
             batch.remove(&store.contribution_facts, pair(*cell, session));
         }
         batch.insert(&store.contributed, session.to_key(), encoded("how much was contributed", contributed)?);
+        match own_frame {
+            OwnFrame::Put { contribution, sought } => {
+                for (keyspace, bytes) in [(&store.own_frames, contribution), (&store.sought, sought)] {
+                    if let Some(bytes) = bytes {
+                        batch.insert(keyspace, session.to_key(), bytes);
+                    }
+                }
+            }
+            OwnFrame::Stays => {}
+            OwnFrame::Goes => {
+                batch.remove(&store.own_frames, session.to_key());
+                batch.remove(&store.sought, session.to_key());
+            }
+        }
         Ok(batch.commit()?)
     }
 
@@ -318,18 +377,40 @@ impl StoreBatch<'_> {
     pub(super) fn remove_contributions(&mut self, session: SessionId) -> Result<(), JournalError> {
         let Some(bytes) = self.store.contributed.get(session.to_key())? else { return Ok(()) };
         let contributed: Contributed = decoded("how much was contributed", &bytes)?;
-        for cell in contributed.cells {
-            self.batch.remove(&self.store.contributions, pair(cell, session));
-            self.batch.remove(&self.store.contribution_facts, pair(cell, session));
+        for cell in &contributed.cells {
+            self.batch.remove(&self.store.contributions, pair(*cell, session));
+            self.batch.remove(&self.store.contribution_facts, pair(*cell, session));
             self.batch.insert(&self.store.cell_purges, cell.to_key(), []);
         }
         self.batch.remove(&self.store.contributed, session.to_key());
+        self.batch.remove(&self.store.own_frames, session.to_key());
+        self.batch.remove(&self.store.sought, session.to_key());
+        self.withdraw_those_found_on(&contributed.cells)
+    }
+
+    /// Takes the drives that were found on cells, of which another is deleted, off the map: they are where they are because
+    /// of it, maybe.
+    fn withdraw_those_found_on(&mut self, cells: &[CellId]) -> Result<(), JournalError> {
+        for entry in self.store.sought.iter() {
+            let session = session_of(&entry.key()?)?;
+            let Some(bytes) = self.store.contributed.get(session.to_key())? else { continue };
+            let contributed: Contributed = decoded("how much was contributed", &bytes)?;
+            if !contributed.cells.iter().any(|cell| cells.contains(cell)) {
+                continue;
+            }
+            for cell in contributed.cells {
+                self.batch.remove(&self.store.contributions, pair(cell, session));
+                self.batch.remove(&self.store.contribution_facts, pair(cell, session));
+            }
+            self.batch.remove(&self.store.contributed, session.to_key());
+            self.batch.remove(&self.store.sought, session.to_key());
+        }
         Ok(())
     }
 }
 
 impl Store {
-    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 9] {
+    pub(super) fn map_keyspaces(&self) -> [&fjall::Keyspace; 11] {
         [
             &self.contributions,
             &self.contribution_facts,
@@ -340,6 +421,8 @@ impl Store {
             &self.cell_purges,
             &self.publications,
             &self.cell_events,
+            &self.own_frames,
+            &self.sought,
         ]
     }
 }

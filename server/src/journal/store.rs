@@ -66,6 +66,8 @@ pub(super) struct Store {
     pub(super) cell_purges: Keyspace,
     pub(super) publications: Keyspace,
     pub(super) cell_events: Keyspace,
+    pub(super) own_frames: Keyspace,
+    pub(super) sought: Keyspace,
 }
 
 /// Writes that become durable together or not at all.
@@ -104,6 +106,8 @@ impl Store {
             cell_purges: keyspace("cell_purges", MAX_SMALL_MEMTABLE_BYTES)?,
             publications: keyspace("publications", MAX_SMALL_MEMTABLE_BYTES)?,
             cell_events: keyspace("cell_events", MAX_SMALL_MEMTABLE_BYTES)?,
+            own_frames: keyspace("own_frames", MAX_MEMTABLE_BYTES)?,
+            sought: keyspace("sought", MAX_SMALL_MEMTABLE_BYTES)?,
             folder: folder.to_owned(),
             database,
         })

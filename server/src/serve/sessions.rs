@@ -1,6 +1,9 @@
 //! `/sessions`: which drives there are, and the lanes of each.
 
-use std::{collections::BTreeSet, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use axum::{
     Json,
@@ -25,6 +28,7 @@ use super::{
     query::{Parameters, parse_limit},
 };
 use crate::{
+    fuse::localizing::Alignment,
     map_service::lane_map,
     session::{PublishedMap, SessionId, SessionState, SessionSummary, Sessions},
 };
@@ -71,6 +75,9 @@ struct Entry {
     /// Whether it is in the shared map: `shared map`, `own frame` without a place on the earth, or `kept apart` where it
     /// fits no other drive, or not in one place only.
     placement: &'static str,
+    /// Whether it was found on the shared map, of a session without a place on the earth of its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    aligned_to_map: Option<AlignedToMap>,
     #[serde(skip_serializing_if = "Option::is_none")]
     last_frame_at: Option<String>,
     /// West, south, east and north border of its lanes.
@@ -79,6 +86,41 @@ struct Entry {
     #[serde(skip_serializing_if = "Option::is_none")]
     vehicle: Option<Vehicle>,
     links: Vec<Link>,
+}
+
+/// What came of the search for a session without GNSS on the shared map.
+#[derive(Debug, PartialEq, Serialize)]
+struct AlignedToMap {
+    /// `aligned`, `own_frame`, `not_unique` or `no_fit`.
+    state: &'static str,
+    /// The same in words.
+    why: &'static str,
+    /// Standard deviation of its place on the map in the worst direction, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sigma_m: Option<f64>,
+    /// Way of it that lies on the map, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    way_m: Option<f64>,
+}
+
+impl AlignedToMap {
+    fn new(alignment: Alignment) -> Self {
+        let of = |state, why| Self { state, why, sigma_m: None, way_m: None };
+        match alignment {
+            Alignment::OwnFrame => of("own_frame", "it has no GNSS, and is too short to be sought on the map"),
+            Alignment::MapTooLarge => of("own_frame", "the map has more line than max_localization_km"),
+            Alignment::Straight => {
+                of("not_unique", "its road does not bend enough to tell where along it the drive is")
+            }
+            Alignment::NotUnique => of("not_unique", "it fits in more than one place of the map"),
+            Alignment::NoFit => of("no_fit", "it fits nowhere on the map"),
+            Alignment::Aligned { sigma_m, way_m } => Self {
+                sigma_m: Some(rounded(sigma_m, 1e3)),
+                way_m: Some(rounded(way_m, 10.0)),
+                ..of("aligned", "its lanes fit the map in one place only")
+            },
+        }
+    }
 }
 
 /// Where the vehicle of a session was at its last frame. It has no name here.
@@ -110,14 +152,24 @@ pub(super) async fn list(
     let cells = state.map.list();
     let kept_apart: BTreeSet<SessionId> =
         cells.iter().flat_map(|(_, record)| record.kept_apart.iter().copied()).collect();
-    let apart = |map: &SessionSummary| kept_apart.contains(&map.session);
-    let parts: Vec<_> = maps.iter().map(|map| (identity(map), map.state as u8, apart(map))).collect();
+    let aligned: BTreeMap<SessionId, AlignedToMap> = maps
+        .iter()
+        .filter(|map| map.georeference.is_none())
+        .map(|map| (map.session, AlignedToMap::new(state.map.alignment(&map.session))))
+        .collect();
+    let part = |map: &Arc<SessionSummary>| {
+        let alignment = aligned.get(&map.session).map(|aligned| (aligned.why, aligned.way_m.map(f64::to_bits)));
+        (identity(map), map.state as u8, kept_apart.contains(&map.session), alignment)
+    };
+    let parts: Vec<_> = maps.iter().map(part).collect();
     let tag = EntityTag::of((total, limit, more, parts, &base));
     if tag.is_held_by(&headers) {
         return Ok(tag.not_modified());
     }
     let page = in_background(move || {
-        let sessions: Vec<_> = maps.iter().map(|map| entry(map, &extents, &kept_apart, &base)).collect();
+        let mut aligned = aligned;
+        let sessions: Vec<_> =
+            maps.iter().map(|map| entry(map, &extents, &kept_apart, aligned.remove(&map.session), &base)).collect();
         let last = sessions.last().filter(|_| more);
         let next = last.map(|last| Link {
             rel: "next",
@@ -134,7 +186,13 @@ pub(super) fn identity(map: &SessionSummary) -> (u64, u64, bool) {
     (u64::from_be_bytes(map.session.to_key()), map.version.0, map.georeference.is_some())
 }
 
-fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionId>, base: &LinkBase) -> Entry {
+fn entry(
+    map: &SessionSummary,
+    extents: &Extents,
+    kept_apart: &BTreeSet<SessionId>,
+    aligned_to_map: Option<AlignedToMap>,
+    base: &LinkBase,
+) -> Entry {
     let path = base.link(&format!("/sessions/{}", map.session));
     let link = |rel, media_type, tail: &str| Link { rel, media_type, href: format!("{path}/{tail}") };
     let mut links = vec![
@@ -154,11 +212,12 @@ fn entry(map: &SessionSummary, extents: &Extents, kept_apart: &BTreeSet<SessionI
         lanes: map.lanes,
         frames: map.version.0,
         georeferenced: map.georeference.is_some(),
-        placement: match map.georeference {
-            None => "own frame",
-            Some(_) if kept_apart.contains(&map.session) => "kept apart",
-            Some(_) => "shared map",
+        placement: match &aligned_to_map {
+            Some(aligned) if aligned.state != "aligned" => "own frame",
+            _ if kept_apart.contains(&map.session) => "kept apart",
+            _ => "shared map",
         },
+        aligned_to_map,
         last_frame_at: map.last_sequence.map(|_| rfc3339(map.last_time)),
         bbox: border(map, extents),
         vehicle: map.last_sequence.map(|_| vehicle(map)),
@@ -287,7 +346,8 @@ mod tests {
         let mut map = published(1, 0);
         map.summary.last_sequence = None;
         let entry =
-            serde_json::to_value(entry(&map, &Extents::default(), &BTreeSet::new(), &LinkBase::of_path(""))).unwrap();
+            serde_json::to_value(entry(&map, &Extents::default(), &BTreeSet::new(), None, &LinkBase::of_path("")))
+                .unwrap();
         assert!(entry.get("bbox").is_none() && entry.get("vehicle").is_none());
         assert_eq!(entry["state"], "live");
     }

@@ -179,7 +179,10 @@ fn listed_session() -> Value {
         "id": text(), "state": { "type": "string", "enum": ["live", "idle", "closed"] }, "version": count(),
         "lanes": count(), "frames": count(), "georeferenced": { "type": "boolean" }, "placement": text(), "links": links(),
     });
-    object(members, json!({ "last_frame_at": time(), "bbox": box_of(4), "vehicle": vehicle }))
+    let states = json!({ "type": "string", "enum": ["aligned", "own_frame", "not_unique", "no_fit"] });
+    let aligned = object(json!({ "state": states, "why": text() }), json!({ "sigma_m": number(), "way_m": number() }));
+    let optional = json!({ "last_frame_at": time(), "bbox": box_of(4), "vehicle": vehicle, "aligned_to_map": aligned });
+    object(members, optional)
 }
 
 fn differences() -> Value {

@@ -8,7 +8,10 @@ use std::{
     time::Duration,
 };
 
-use lanemap_proto::encode;
+use lanemap_proto::{
+    encode,
+    v1::{self, stream_observations_request},
+};
 use lanemap_tests::{drives, http, raw_stream::RawStream};
 use opentelemetry_proto::tonic::{
     collector::trace::v1::{
@@ -81,6 +84,7 @@ async fn a_collector_sees_the_frames_of_a_stream_and_no_name_of_its_vehicle() {
         stream.send_frame(encode::frame(frame)).await;
     }
     stream.acked(20).await;
+    stream.send(stream_observations_request::Message::End(v1::SessionEnd {})).await;
     stream.end().await.unwrap();
     assert_eq!(http::get(format!("{url}/sessions")).await.unwrap().status().as_u16(), 200);
 

@@ -162,11 +162,11 @@ mod tests {
     fn a_drive_is_sought_when_it_is_long_enough_and_again_when_it_or_the_map_has_grown() {
         assert!(!Sought::default().is_due(LEAST_WAY_M - 1.0, 5_000.0));
         assert!(Sought::default().is_due(LEAST_WAY_M, 5_000.0));
-        let not_found = Sought { alignment: Alignment::NoFit, way_m: 300.0, map_m: 10_000.0 };
-        assert!(!not_found.is_due(440.0, 10_400.0));
-        assert!(not_found.is_due(450.0, 10_400.0) && not_found.is_due(300.0, 10_500.0));
-        let found = Sought { alignment: Alignment::Aligned { sigma_m: 0.2, way_m: 300.0 }, ..not_found };
-        assert!(!found.is_due(300.0, 20_000.0), "it stays where it is");
-        assert!(found.is_due(450.0, 10_000.0));
+        let not_found = Sought { alignment: Alignment::NoFit, way_m: 600.0, map_m: 10_000.0 };
+        assert!(!not_found.is_due(740.0, 10_400.0));
+        assert!(not_found.is_due(750.0, 10_400.0) && not_found.is_due(600.0, 10_500.0));
+        let found = Sought { alignment: Alignment::Aligned { sigma_m: 0.2, way_m: 600.0 }, ..not_found };
+        assert!(!found.is_due(600.0, 20_000.0), "it stays where it is");
+        assert!(found.is_due(750.0, 10_000.0));
     }
 }

@@ -4,7 +4,7 @@
 
 use std::{
     io::{BufRead, BufReader},
-    process::{Command, Stdio},
+    process::{Child, Command, Stdio},
     time::Duration,
 };
 
@@ -28,6 +28,17 @@ use tonic::{Request, Response, Status, transport::Server};
 
 /// Longest wait for what takes seconds: spans are sent in batches, every five seconds.
 const PATIENCE: Duration = Duration::from_mins(1);
+
+/// The command as a process of its own; killed where a test fails, too.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
 
 /// Passes on what it is sent.
 struct Collector(mpsc::UnboundedSender<ExportTraceServiceRequest>);
@@ -65,13 +76,14 @@ async fn a_collector_sees_the_frames_of_a_stream_and_no_name_of_its_vehicle() {
     tokio::spawn(Server::builder().add_service(service).serve_with_incoming(TcpListenerStream::new(listener)));
 
     let folder = tempfile::tempdir().unwrap();
-    let mut lanemap = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"))
+    let child = Command::new(env!("CARGO_BIN_EXE_lanemap-under-test"))
         .args(["serve", "--listen", "127.0.0.1:0", "--otlp-endpoint", &collector, "--data-dir"])
         .arg(folder.path())
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    let line = BufReader::new(lanemap.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+    let mut lanemap = Running(child);
+    let line = BufReader::new(lanemap.0.stdout.take().unwrap()).lines().next().unwrap().unwrap();
     let url =
         line.split_whitespace().find(|word| word.starts_with("http://")).unwrap().trim_end_matches(',').to_owned();
 
@@ -105,7 +117,6 @@ async fn a_collector_sees_the_frames_of_a_stream_and_no_name_of_its_vehicle() {
         }
     };
     let received = timeout(PATIENCE, receiving).await;
-    lanemap.kill().unwrap();
-    lanemap.wait().unwrap();
+    drop(lanemap);
     assert!(received.is_ok(), "{committed} frames committed, stream seen: {streamed}, request seen: {asked}");
 }

@@ -64,7 +64,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        fleet::{DriveId, TrajectoryPoint},
+        fleet::{DriveId, PlacedBy, TrajectoryPoint},
         frame::{GnssFix, TimestampNs},
         sensor::Sensor,
     };
@@ -101,6 +101,7 @@ mod tests {
                 drive: DriveId(number as u64),
                 started: TimestampNs(0),
                 sensor: Sensor::default(),
+                placed_by: PlacedBy::Receiver,
                 trajectory: trajectory.collect(),
                 lanes: vec![],
             }

@@ -209,8 +209,7 @@ impl<'a> Fusion<'a> {
     fn place_drive(&mut self, drive: usize, first_pass: usize, pieces: &mut Pieces, is_last_chance: bool) -> bool {
         let prepared = &self.drives[drive];
         for (index, pass) in prepared.passes.iter().enumerate() {
-            let sigma_m =
-                if index == 0 { self.restraints[drive].place_sigma_m } else { self.params.gnss_bias_sigma_m };
+            let sigma_m = if index == 0 { self.restraints[drive].place_sigma_m } else { self.params.gnss_bias_sigma_m };
             match self.lay(drive, pass, sigma_m, is_last_chance) {
                 Placement::Refused if index == 0 => return false,
                 // A later pass that fits nowhere lies where odometry puts it after the one before.

@@ -111,7 +111,7 @@ async fn a_collector_sees_the_frames_of_a_stream_and_no_name_of_its_vehicle() {
             for span in spans(&export) {
                 let route = attribute(span, "route").unwrap_or_default();
                 committed += attribute(span, "frames").and_then(|frames| frames.parse::<u64>().ok()).unwrap_or(0);
-                streamed |= span.name == "request" && route.contains("StreamObservations");
+                streamed |= span.name == "request" && route.contains("IngestService");
                 asked |= span.name == "request" && route == "/sessions" && attribute(span, "status").unwrap() == "200";
             }
         }

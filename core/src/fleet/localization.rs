@@ -5,9 +5,9 @@
 //! inference filter*, 2012; for lanes on maps Poggenhans, Salscheider and Stiller, *Precise localization in high-definition
 //! road maps for urban regions*, IROS 2018) the drive is found in four steps:
 //!
-//! 1. [`hypotheses`]: windows of its lanes that bend are slid along the heading profiles of all lines, both ways; the windows
+//! 1. `hypotheses`: windows of its lanes that bend are slid along the heading profiles of all lines, both ways; the windows
 //!    vote for each other's poses.
-//! 2. [`mod@fit`]: at each place that many of them vote for, all of its lanes are laid on all lines, from there outwards and
+//! 2. `fit`: at each place that many of them vote for, all of its lanes are laid on all lines, from there outwards and
 //!    as far as odometry lets them, and what lies where is summed to a log-likelihood.
 //! 3. The best place must explain most of the drive, and the drive most of the lines beside its way.
 //! 4. Every other place, those a little farther along the road and a lane over among them, must be less likely by a

@@ -11,12 +11,12 @@ use nalgebra::{Matrix3, Point3, Vector2, Vector3};
 
 use super::hypotheses::Hypothesis;
 use crate::fleet::{
-    alignment::{RobustScales, Sighting, Target, align},
+    alignment::{RobustScales, Sighting, Target, align_one},
     contribution::Contribution,
     correction::Correction,
     georeferenced::UNBOUNDED_M,
     line::Lines,
-    matching::offset_from,
+    matching::{Foot, foot_on},
     params::FleetParams,
     prepared::{LaneSample, PreparedDrive, PreparedLane, Restraints, count_of, normal_of},
 };
@@ -116,8 +116,8 @@ impl<'a> Sought<'a> {
 
     /// Lays the drive on lines about a place; `None` where it does not fit there.
     pub(super) fn fit(&self, at: &Hypothesis, lines: &Lines) -> Option<Fit> {
-        let rigid = Correction::rigid(&self.contribution.trajectory, at.yaw_rad, |point| at.apply(point), self.params);
-        let mut corrections = [rigid];
+        let mut correction =
+            Correction::rigid(&self.contribution.trajectory, at.yaw_rad, |point| at.apply(point), self.params);
         let whole_m = self.contribution.trajectory.last().map_or(0.0, |last| last.arc_m);
         let mut done_m = 0.0;
         for (reach_m, gate_m, robust_m) in STEPS {
@@ -125,14 +125,13 @@ impl<'a> Sought<'a> {
                 continue;
             }
             done_m = reach_m;
-            let (sightings, of) = self.sightings(&corrections[0], lines, at.arc_m, reach_m, gate_m);
+            let (sightings, of) = self.sightings(&correction, lines, at.arc_m, reach_m, gate_m);
             if (sightings.len() as f64) < LEAST_ON_THE_WAY * of as f64 || sightings.len() < 8 {
                 return None;
             }
             let scales = RobustScales { lanes_m: robust_m, fixes_m: UNBOUNDED_M };
-            align(&[&self.restraints], &mut corrections, &sightings, 0, scales);
+            align_one(&self.restraints, &mut correction, &sightings, scales);
         }
-        let [correction] = corrections;
         correction.knots().iter().all(|knot| knot.shared.coords.iter().all(|value| value.is_finite())).then_some(())?;
         Some(self.judge(correction, lines))
     }
@@ -293,7 +292,7 @@ fn nearest(lines: &Lines, correction: &Correction, sample: &LaneSample, gate_m: 
     let place = correction.apply(&sample.map, sample.arc_m);
     let normal = normal_of(&correction.turn(&sample.tangent, sample.arc_m));
     let beside = lines.near(&place, gate_m + 2.0).into_iter().filter_map(|(line, knot)| {
-        let (parameter, across_m, height_m) = offset_from(lines, line, knot, &place)?;
+        let Foot { parameter, across_m, height_m, .. } = foot_on(lines, line, knot as f64, &place)?;
         let cosine = normal_of(&lines.lines[line].tangent(knot)).dot(&normal);
         let fits = across_m.abs() <= gate_m && cosine.abs() >= LEAST_COSINE && height_m.abs() <= ANOTHER_LEVEL_M;
         fits.then_some(OnLine { line, parameter, across_m, height_m })

@@ -101,10 +101,26 @@ impl Fusion<'_> {
 impl Naming {
     fn new(pass: usize, posterior: &[f64]) -> Option<Self> {
         let posterior: &[f64; CATEGORIES] = posterior.try_into().ok()?;
+        let posterior = &either_way(posterior);
         let likelihoods = posterior.map(|own| (1.0 - CONFUSED) * own + WRONG);
         let best = (0..CATEGORIES).max_by(|a, b| posterior[*a].total_cmp(&posterior[*b]))?;
         Some(Self { pass: u32::try_from(pass).ok()?, best, likelihoods })
     }
+}
+
+/// A belief over categories as drives of both directions share it: what is left to the one is right to the other.
+fn either_way(posterior: &[f64; CATEGORIES]) -> [f64; CATEGORIES] {
+    use Category as C;
+    const MIRRORED: [(Category, Category); 3] = [
+        (C::RightCurb, C::LeftCurb),
+        (C::WhiteLeftSolidRightDashed, C::WhiteLeftDashedRightSolid),
+        (C::YellowLeftSolidRightDashed, C::YellowLeftDashedRightSolid),
+    ];
+    let mut posterior = *posterior;
+    for (mirrored, kept) in MIRRORED {
+        posterior[kept.index()] += std::mem::take(&mut posterior[mirrored.index()]);
+    }
+    posterior
 }
 
 /// What is believed of the paint of each knot of a line, whose witnesses together take it for `usual`.
@@ -174,6 +190,8 @@ fn disputed(before: &[Option<Paint>], names: &[Vec<Naming>]) -> Vec<usize> {
 struct Dispute<'a> {
     before: Option<Paint>,
     names: &'a [Naming],
+    /// Which of the categories is a curb's.
+    curb: Option<usize>,
     /// Of each pass, which of the categories it names.
     best: Vec<Option<usize>>,
     /// Logarithm of the likelihood that folded drives leave each category.
@@ -228,7 +246,14 @@ impl<'a> Dispute<'a> {
             Some(before) if before.category.index() == *category => before.probability.max(0.5).ln(),
             Some(before) => ((1.0 - before.probability.max(0.5)) / categories.len() as f64).ln(),
         });
-        Self { before, names, best, left: left.collect(), sums, since }
+        let curb = categories.iter().position(|category| *category == Category::LeftCurb.index());
+        Self { before, names, curb, best, left: left.collect(), sums, since }
+    }
+
+    /// Whether a curb would have become paint, or paint a curb, which it never is: a line and the curb beside it were taken
+    /// for one.
+    fn is_curb(&self, verdict: &Verdict) -> bool {
+        [verdict.from, verdict.now].into_iter().any(|category| self.curb == Some(category))
     }
 
     /// The change that is believed after so many passes: from which category to which.
@@ -239,7 +264,7 @@ impl<'a> Dispute<'a> {
         let is_told = told_before || tell(old, verdict.from) >= LEAST_TELLING_OLD;
         let told_new = tell(new, verdict.now);
         let is_new = told_new >= LEAST_TELLING_NEW && 2 * told_new >= tell(new, verdict.from);
-        (verdict.changed >= BELIEVED && is_told && is_new && !self.names.is_empty())
+        (verdict.changed >= BELIEVED && !self.is_curb(verdict) && is_told && is_new && !self.names.is_empty())
             .then_some((verdict.from, verdict.now))
     }
 }
@@ -400,6 +425,15 @@ mod tests {
         let paints = after(100, "aaaaaaaaabababbab", "aaaaaaaaaaaaaaaaa", 40..70);
         let change = paints[55].change.unwrap();
         assert_eq!((change.from, change.to, paints[10].change), (A, B, None));
+    }
+
+    #[test]
+    fn a_curb_that_lies_left_of_some_drives_and_right_of_others_is_one() {
+        let (left, right) = (Category::LeftCurb, Category::RightCurb);
+        let names = |pass| naming(pass, if pass < 6 { left } else { right });
+        let speakers: Vec<Speaker> = (0..).take(12).map(|pass| (TimestampNs(pass), DriveId(0))).collect();
+        let told = paints(&[None; 20], &vec![(0..12).map(names).collect(); 20], &speakers, left);
+        assert!(told.iter().all(|paint| paint.change.is_none()), "{:?}", told[10]);
     }
 
     #[test]

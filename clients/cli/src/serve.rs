@@ -231,7 +231,7 @@ pub struct ServeArgs {
     max_contributions_per_cell: Option<usize>,
     /// Kilometres of line up to which drives without GNSS are sought on the shared map, 0 to 1e6; 0: they stay in their own
     /// frames. A search takes some 0.2 s of a fusing thread for 40 km of line
-    /// [env: LANEMAP_MAX_LOCALIZATION_KM] [default: 1000]
+    /// [env: LANEMAP_MAX_LOCALIZATION_KM] [default: 1000.0]
     #[arg(long, value_name = "KM")]
     max_localization_km: Option<f64>,
     /// Time for which a version of a cell is kept once it was replaced, seconds, so that changes since it can be told;

@@ -6,7 +6,7 @@
 //! `log L_w(d) = share * sum_samples log max(e, max_lines a exp(-(n . d - x)^2 / 2 s^2))`,
 //!
 //! where `x` is how far to the left the sample would have to move to lie on the line, `n` that direction, and `a` how well the
-//! categories agree. Where drives went that the sample meets, `L` is lower: [`ways`](super::ways) are not shared by those that
+//! categories agree. Where drives went that the sample meets, `L` is lower: `ways` are not shared by those that
 //! meet. The most probable sequence of shifts over the windows (Viterbi) allows for the drift of odometry
 //! between them and for the prior of GNSS. It is believed only if it explains most of what is there, and clearly better
 //! than the same sequence shifted across the road by about a lane.

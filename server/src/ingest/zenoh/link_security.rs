@@ -1,9 +1,10 @@
 //! TLS and passwords of zenoh's links, from the files that secure gRPC and HTTP too.
 //!
-//! A link over TLS may break by itself: zenoh 1.10 reads and writes the same TLS connection from two threads without a
-//! lock (<https://github.com/eclipse-zenoh/zenoh/issues/2557>), and a write that meets a read ends the link, on the side
-//! of the server or of the vehicle, once in some thousands of messages. Vehicles connect again and send what was not
-//! acked; whoever wants TLS without such breaks takes gRPC.
+//! As it is published, zenoh 1.10 reads and writes the same TLS connection from two threads without a lock
+//! (<https://github.com/eclipse-zenoh/zenoh/issues/2557>): a write that meets a read ends the link, once in some thousands of
+//! messages, and may end the process. This server and the Rust client build the link with a lock (`server/vendor`); a
+//! vehicle that brings its own zenoh may still lose its link by itself. It connects again, and sends what was not acked;
+//! whoever wants TLS without such breaks takes gRPC.
 
 use std::path::Path;
 

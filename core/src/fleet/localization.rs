@@ -174,12 +174,11 @@ struct Candidate {
 #[must_use]
 pub fn localize(contribution: &Contribution, atlas: &LineAtlas, params: &FleetParams) -> Localization {
     let contribution = without_fixes(contribution);
-    let (Some(last), Some(first_cell)) = (contribution.trajectory.last(), atlas.cells().next()) else {
-        return if contribution.trajectory.is_empty() { Localization::TooShort } else { Localization::NoFit };
-    };
-    if last.arc_m < LEAST_WAY_M {
+    let [first, .., last] = contribution.trajectory.as_slice() else { return Localization::TooShort };
+    if last.arc_m - first.arc_m < LEAST_WAY_M {
         return Localization::TooShort;
     }
+    let Some(first_cell) = atlas.cells().next() else { return Localization::NoFit };
     let prepared = PreparedDrive::new(&contribution, &first_cell.anchor(), params);
     let sought = Sought::new(&contribution, &prepared, params);
     let windows = windows(sought.lanes());

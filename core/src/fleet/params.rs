@@ -45,9 +45,9 @@ pub struct FleetParams {
     pub least_shared: f64,
     /// Distance from others' lines at which a drive counts as having gone where they did, metres.
     pub strangers_within_m: f64,
-    /// Drives that are kept apart at least; the younger ones.
+    /// Crowd that is kept apart at least: on one road so many drives, in a town more (`crowding`); the younger ones.
     pub drives_apart: usize,
-    /// Drives that are folded at once; the oldest.
+    /// Crowd that is folded at once; the oldest drives.
     pub drives_per_fold: usize,
     /// Rounds of solving and matching.
     pub rounds: usize,

@@ -1,5 +1,7 @@
 //! A thread that cuts drives into contributions and fuses cells, one task after the other.
 
+mod contributing;
+
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, PoisonError, atomic::Ordering},
@@ -8,17 +10,16 @@ use std::{
 
 use lanemap_core::{
     TimestampNs,
-    fleet::{CellId, Contribution, DriveId, FleetParams, FusedMap},
+    fleet::{CellId, DriveId, FleetParams, FusedMap},
 };
 use lanemap_proto::v1;
 use prost::Message;
 
 use super::{
-    CellRecord, CellVersion, Fuser, Offer,
+    CellRecord, CellVersion, Fuser,
     border::{self, Crossing, Piece},
     cell_record::fingerprint,
     events::{self, CellEvent, Kept, Known},
-    localizing::{Searched, Sought},
     now_ms,
     publications::Publication,
     queue::{Taken, Task, Wanted},
@@ -27,12 +28,9 @@ use super::{
 use crate::{
     journal::{
         JournalError,
-        cells::{
-            CellStore, CellWrite, Contributed, ContributionFact, Facts, NewVersion, OwnFrame, StoredContribution,
-            encoded,
-        },
+        cells::{CellStore, CellWrite, ContributionFact, Facts, NewVersion, encoded},
     },
-    session::{MapVersion, SessionId},
+    session::SessionId,
     telemetry,
 };
 
@@ -180,107 +178,6 @@ impl Worker {
             let pause = until.saturating_duration_since(Instant::now());
             queue = self.fuser.shared.woken.wait_timeout(queue, pause).unwrap_or_else(PoisonError::into_inner).0;
         }
-    }
-
-    /// Puts what a drive says into the store, where it is not what it said before.
-    fn contribute(&self, offer: &Offer) -> Result<(), JournalError> {
-        let started = Instant::now();
-        let session = offer.session;
-        let before = self.fuser.queue().contributed(session).cloned().unwrap_or_default();
-        if offer.georeference.is_none() {
-            let Some(whole) = offer.whole() else { return Ok(()) };
-            return self.seek(session, &whole, Some(offer.version));
-        }
-        let map = &self.fuser.shared.map;
-        let had_none = map.sought(session).is_some();
-        let own_frame = if had_none { OwnFrame::Goes } else { OwnFrame::Stays };
-        self.say(session, offer.contributions()?, &before, offer.version, own_frame)?;
-        if had_none {
-            map.tell_sought(session, None);
-        }
-        metrics::histogram!(telemetry::CONTRIBUTE_SECONDS).record(started.elapsed().as_secs_f64());
-        Ok(())
-    }
-
-    /// Seeks a drive without GNSS again, on a map that has grown.
-    fn locate(&self, session: SessionId) -> Result<(), JournalError> {
-        if !self.store.purges()?.is_empty() {
-            return Err(JournalError::Store("a drive that was deleted is still being taken out of the map".to_owned()));
-        }
-        let Some(whole) = self.store.own_frame(session)? else { return Ok(()) };
-        self.seek(session, &whole, None)
-    }
-
-    /// Seeks a drive without GNSS on the map, where that is due, and puts what it says there into the store. `version` is that
-    /// of its map, where that is new.
-    fn seek(&self, session: SessionId, whole: &Contribution, version: Option<MapVersion>) -> Result<(), JournalError> {
-        let map = &self.fuser.shared.map;
-        let before = map.sought(session);
-        let searched = {
-            let mut searched = self.fuser.shared.searched.lock().unwrap_or_else(PoisonError::into_inner);
-            searched.seek(whole, before, map, self.fuser.shared.settings.most_searched_m)?
-        };
-        // A deletion may have taken the drive off the map meanwhile: the store knows.
-        let mut contributed = self.store.contributed_of(session)?;
-        let contribution = version.map(|_| encoded("a drive in its own frame", whole)).transpose()?;
-        let version = version.unwrap_or(contributed.version);
-        contributed.version = version;
-        let Some(Searched { sought, contributions }) = searched else {
-            let own_frame = OwnFrame::Put { contribution, sought: None };
-            self.store.contribute(session, &contributed, Vec::new(), &[], own_frame)?;
-            self.fuser.queue().has_contributed(session, contributed);
-            if before.is_none() {
-                map.tell_sought(session, Some(Sought::default()));
-            }
-            return Ok(());
-        };
-        tracing::debug!(%session, alignment = ?sought.alignment, "a drive without GNSS was sought on the map");
-        let own_frame = OwnFrame::Put { contribution, sought: Some(encoded("a search", &sought)?) };
-        self.say(session, contributions, &contributed, version, own_frame)?;
-        map.tell_sought(session, Some(sought));
-        Ok(())
-    }
-
-    /// Puts what a drive says into the store, in the place of what it said before.
-    fn say(
-        &self,
-        session: SessionId,
-        mut changed: Vec<StoredContribution>,
-        before: &Contributed,
-        version: MapVersion,
-        own_frame: OwnFrame,
-    ) -> Result<(), JournalError> {
-        let cells: Vec<CellId> = changed.iter().map(|contribution| contribution.cell).collect();
-        let left: Vec<CellId> =
-            before.cells.iter().filter(|cell| cells.binary_search(cell).is_err()).copied().collect();
-        let mut kept = Vec::with_capacity(changed.len());
-        for contribution in changed.drain(..) {
-            let known = self.store.facts_of(contribution.cell)?;
-            if known.get(&session) != Some(&contribution.fact)
-                && self.is_young_enough(&known, session, &contribution.fact)
-            {
-                kept.push(contribution);
-            }
-        }
-        let touched: Vec<CellId> =
-            kept.iter().map(|contribution| contribution.cell).chain(left.iter().copied()).collect();
-        let contributed = Contributed { version, cells };
-        metrics::counter!(telemetry::CONTRIBUTIONS).increment(kept.len() as u64);
-        self.store.contribute(session, &contributed, kept, &left, own_frame)?;
-        let mut queue = self.fuser.queue();
-        queue.has_contributed(session, contributed);
-        for cell in touched {
-            queue.touch_cell(cell, Instant::now());
-        }
-        Ok(())
-    }
-
-    /// Whether a contribution is among those that its cell keeps: the youngest drives.
-    fn is_young_enough(&self, known: &Facts, session: SessionId, fact: &ContributionFact) -> bool {
-        let younger = known
-            .iter()
-            .filter(|(other, known)| **other != session && (known.started, known.drive) > (fact.started, fact.drive));
-        younger.count() < self.fuser.shared.settings.max_contributions
     }
 
     /// Brings a cell up to date: fuses it where it is not fused from what the store has, and joins it with its neighbours.

@@ -197,16 +197,6 @@ fn agreement(a: &[f64], b: &[f64]) -> f64 {
     FLOOR + (1.0 - FLOOR) * a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().min(1.0)
 }
 
-/// Log-likelihood of a sample that moves to the left.
-fn support(vote: &Vote<'_>, move_m: f64) -> f64 {
-    let best = vote.lines.iter().map(|beside| {
-        let ratio = (move_m - beside.move_m) / SCATTER_M;
-        beside.log_agreement - 0.5 * ratio * ratio
-    });
-    let unmatched = if misfit_m(vote, move_m) > BESIDE_M { OFF_THE_MAP } else { OUTLIER };
-    best.fold(unmatched.ln(), f64::max)
-}
-
 /// Distance from a sample, moved, to the nearest line, metres.
 fn misfit_m(vote: &Vote<'_>, move_m: f64) -> f64 {
     vote.lines.iter().map(|beside| (move_m - beside.move_m).abs()).fold(f64::INFINITY, f64::min)

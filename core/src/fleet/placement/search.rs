@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, f64::consts::PI};
 
 use nalgebra::Vector2;
 
-use super::{Prior, STRIDE, Vote, WINDOW_M, meeting::Meeting, support};
+use super::{BESIDE_M, OFF_THE_MAP, OUTLIER, Prior, SCATTER_M, STRIDE, Vote, WINDOW_M, meeting::Meeting};
 use crate::fleet::{params::FleetParams, prepared::count_of};
 
 /// Step of the search, metres.
@@ -104,15 +104,14 @@ fn likelihoods(
     let shifts: Vec<Vector2<f64>> = (0..square.count()).map(|state| square.shift(state)).collect();
     let farthest_m = square.side as f64 * STEP_M * 2.0_f64.sqrt();
     let half = count_of(farthest_m / FINE_M) + 1;
-    let steps = || (0..=2 * half).map(|step| (step as f64 - half as f64) * FINE_M);
+    let moves_m: Vec<f64> = (0..=2 * half).map(|step| (step as f64 - half as f64) * FINE_M).collect();
+    let mut support = Support::of(&moves_m);
     // Samples of one window whose lanes run alike vote alike: their support is summed before it is asked for at each shift.
     let mut alike: BTreeMap<(usize, i64), (Vector2<f64>, Vec<f64>)> = BTreeMap::new();
     for vote in votes {
         let of_direction = || (vote.normal, vec![0.0; 2 * half + 1]);
         let (_, table) = alike.entry((vote.window, direction(&vote.normal))).or_insert_with(of_direction);
-        for (sum, move_m) in table.iter_mut().zip(steps()) {
-            *sum += share * support(vote, move_m);
-        }
+        support.add_to(table, vote, share);
     }
     let mut windows: Vec<Likelihood> = vec![Vec::new(); windows];
     let add = |window: &mut Likelihood, normal: &Vector2<f64>, table: &[f64]| {
@@ -129,7 +128,7 @@ fn likelihoods(
     for meeting in meetings {
         let window = windows.get_mut(count_of(meeting.arc_m / WINDOW_M)).filter(|window| !window.is_empty());
         if let Some(window) = window {
-            let table: Vec<f64> = steps().map(|move_m| meeting.support(move_m, WINDOW_M)).collect();
+            let table: Vec<f64> = moves_m.iter().map(|move_m| meeting.support(*move_m, WINDOW_M)).collect();
             add(window, &meeting.normal, &table);
         }
     }
@@ -140,6 +139,41 @@ fn likelihoods(
         }
     }
     windows
+}
+
+/// Log-likelihood of a sample that moves to the left, by the move.
+struct Support<'a> {
+    moves_m: &'a [f64],
+    /// By the line that explains it best, and the distance from the nearest.
+    best: Vec<f64>,
+    misfit_m: Vec<f64>,
+}
+
+impl<'a> Support<'a> {
+    fn of(moves_m: &'a [f64]) -> Self {
+        Self { moves_m, best: vec![0.0; moves_m.len()], misfit_m: vec![0.0; moves_m.len()] }
+    }
+
+    /// Adds that of a sample, of which `share` counts. One line after the other: the loops have no branches.
+    fn add_to(&mut self, sums: &mut [f64], vote: &Vote<'_>, share: f64) {
+        self.best.fill(f64::NEG_INFINITY);
+        self.misfit_m.fill(f64::INFINITY);
+        for beside in &vote.lines {
+            let moves = self.moves_m.iter().zip(&mut self.best).zip(&mut self.misfit_m);
+            for ((move_m, best), misfit_m) in moves {
+                let offset_m = move_m - beside.move_m;
+                let ratio = offset_m / SCATTER_M;
+                let own = beside.log_agreement - 0.5 * ratio * ratio;
+                *best = if own > *best { own } else { *best };
+                *misfit_m = if offset_m.abs() < *misfit_m { offset_m.abs() } else { *misfit_m };
+            }
+        }
+        let (off_the_map, outlier) = (OFF_THE_MAP.ln(), OUTLIER.ln());
+        for ((sum, best), misfit_m) in sums.iter_mut().zip(&self.best).zip(&self.misfit_m) {
+            let unmatched = if *misfit_m > BESIDE_M { off_the_map } else { outlier };
+            *sum += share * if *best > unmatched { *best } else { unmatched };
+        }
+    }
 }
 
 /// A direction to within half a degree.
@@ -203,24 +237,27 @@ fn best_of_three(score: &[f64], step: usize, row: usize, jump: f64, best: &mut [
 /// Logarithm of how much more probable the path is than the same path shifted across the road to another place.
 fn margin(windows: &[Likelihood], path: &[usize], votes: &[Vote<'_>], square: Square) -> f64 {
     const DIRECTIONS: usize = 16;
+    let least = windows.iter().map(|window| window.iter().copied().fold(f64::INFINITY, f64::min));
+    let least: Vec<f64> = least.collect();
     let total = |east: isize, north: isize| -> f64 {
-        let at = |(window, state): (&Likelihood, &usize)| match square.moved(*state, east, north) {
+        let at = |((window, least), state): ((&Likelihood, &f64), &usize)| match square.moved(*state, east, north) {
             _ if window.is_empty() => 0.0,
             Some(state) => window[state],
-            None => window.iter().copied().fold(f64::INFINITY, f64::min),
+            None => *least,
         };
-        windows.iter().zip(path).map(at).sum()
+        windows.iter().zip(&least).zip(path).map(at).sum()
     };
-    let across_m = |shift: Vector2<f64>| {
-        let sum: f64 = votes.iter().map(|vote| vote.normal.dot(&shift).abs()).sum();
+    let mean_across = |direction: Vector2<f64>| {
+        let sum: f64 = votes.iter().map(|vote| vote.normal.dot(&direction).abs()).sum();
         sum / votes.len() as f64
     };
     let mut best_other = f64::NEG_INFINITY;
     for direction in 0..DIRECTIONS {
         let (sin, cos) = (2.0 * PI * direction as f64 / DIRECTIONS as f64).sin_cos();
+        let across = mean_across(Vector2::new(cos, sin));
         for radius in 1..=2 * square.side {
             let shift = Vector2::new(cos, sin) * (radius as f64 * STEP_M);
-            if across_m(shift) >= ANOTHER_PLACE_M {
+            if across * radius as f64 * STEP_M >= ANOTHER_PLACE_M {
                 best_other = best_other.max(total(whole(shift.x / STEP_M), whole(shift.y / STEP_M)));
             }
         }

@@ -118,10 +118,41 @@ pub(super) fn align(
     scales: RobustScales,
     eliminations: &mut Eliminations,
 ) {
+    let located = Located::of(drives, corrections, sightings);
+    let problem = Problem { drives, sightings, located: &located, stations, scales };
     for _ in 0..GAUSS_NEWTON_STEPS {
-        align_horizontally(drives, corrections, sightings, stations, scales, &mut eliminations.across);
+        align_horizontally(&problem, corrections, &mut eliminations.across);
     }
-    align_heights(drives, corrections, sightings, stations, scales, &mut eliminations.height);
+    align_heights(&problem, corrections, &mut eliminations.height);
+}
+
+/// What is asked of an alignment.
+struct Problem<'a> {
+    drives: &'a [&'a Restraints],
+    sightings: &'a [Sighting],
+    located: &'a Located,
+    stations: usize,
+    scales: RobustScales,
+}
+
+/// The knot before a place of a way, and the weight of the one after it.
+type Between = (usize, f64);
+
+/// Where along the corrections everything lies: this does not change while they are solved for.
+struct Located {
+    /// Of each drive.
+    fixes: Vec<Vec<Between>>,
+    sightings: Vec<Between>,
+}
+
+impl Located {
+    fn of(drives: &[&Restraints], corrections: &[Correction], sightings: &[Sighting]) -> Self {
+        let fixes = drives.iter().zip(corrections);
+        let fixes =
+            fixes.map(|(drive, correction)| drive.fixes.iter().map(|fix| correction.locate(fix.arc_m)).collect());
+        let sightings = sightings.iter().map(|sighting| corrections[sighting.drive].locate(sighting.arc_m));
+        Self { fixes: fixes.collect(), sightings: sightings.collect() }
+    }
 }
 
 /// The weight that Geman and `McClure` give a residual.
@@ -176,45 +207,78 @@ impl Row {
     }
 }
 
-/// Derivatives of `axis . C(p)` by the unknowns of the knots beside it.
-fn row_across(first: usize, correction: &Correction, map: &Point3<f64>, arc_m: f64, axis: &Vector2<f64>) -> Row {
-    let (knot, weight) = correction.locate(arc_m);
-    let mut row = Row::default();
-    for (knot, weight) in [(knot, 1.0 - weight), (knot + 1, weight)] {
-        if weight > 0.0 {
-            let at = first + 3 * knot;
-            let by_yaw = correction.knots[knot].by_yaw(map).dot(axis);
-            row.push(at, weight * axis.x);
-            row.push(at + 1, weight * axis.y);
-            row.push(at + 2, weight * by_yaw);
-        }
-    }
-    row
+/// A correction with the sine and cosine of the turn of each knot.
+struct Turned<'a> {
+    correction: &'a Correction,
+    turns: Vec<(f64, f64)>,
 }
 
-fn align_horizontally(
-    drives: &[&Restraints],
-    corrections: &mut [Correction],
-    sightings: &[Sighting],
-    stations: usize,
-    scales: RobustScales,
-    elimination: &mut Elimination,
-) {
+/// A place under the correction, and how it moves with the turns of the knots beside it.
+struct Moving {
+    between: Between,
+    place: Vector2<f64>,
+    by_yaw: [Vector2<f64>; 2],
+}
+
+impl<'a> Turned<'a> {
+    fn new(correction: &'a Correction) -> Self {
+        Self { correction, turns: correction.knots.iter().map(|knot| knot.yaw_rad.sin_cos()).collect() }
+    }
+
+    fn moving(&self, map: &Point3<f64>, between: Between) -> Moving {
+        let (knot, weight) = between;
+        let at = |knot: usize| {
+            let (own, (sin, cos)) = (&self.correction.knots[knot], self.turns[knot]);
+            let offset = (map - own.map).xy();
+            let turned = Vector2::new(cos * offset.x - sin * offset.y, sin * offset.x + cos * offset.y);
+            (own.shared.coords.xy() + turned, Vector2::new(-turned.y, turned.x))
+        };
+        let (before, by_first) = at(knot);
+        if weight == 0.0 {
+            return Moving { between, place: before, by_yaw: [by_first, Vector2::zeros()] };
+        }
+        let (after, by_second) = at(knot + 1);
+        Moving { between, place: before + (after - before) * weight, by_yaw: [by_first, by_second] }
+    }
+}
+
+impl Moving {
+    /// Derivatives of the place along an axis by the unknowns of the knots beside it.
+    fn row_along(&self, first: usize, axis: &Vector2<f64>) -> Row {
+        let (knot, weight) = self.between;
+        let mut row = Row::default();
+        for (knot, weight, by_yaw) in [(knot, 1.0 - weight, self.by_yaw[0]), (knot + 1, weight, self.by_yaw[1])] {
+            if weight > 0.0 {
+                let at = first + 3 * knot;
+                row.push(at, weight * axis.x);
+                row.push(at + 1, weight * axis.y);
+                row.push(at + 2, weight * by_yaw.dot(axis));
+            }
+        }
+        row
+    }
+}
+
+fn align_horizontally(problem: &Problem<'_>, corrections: &mut [Correction], elimination: &mut Elimination) {
+    let Problem { drives, sightings, located, stations, scales } = *problem;
     // In common: 2 of the bias, 1 of odometry's scale, 1 of its turn.
     let layout = Layout::new(corrections, 3, 4, stations);
     let mut equations = layout.equations();
-    for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
+    let turned: Vec<Turned<'_>> = corrections.iter().map(Turned::new).collect();
+    for (index, (drive, turned)) in drives.iter().zip(&turned).enumerate() {
         let first = layout.first(index);
-        add_odometry(&mut equations, first, drive, correction);
-        add_fixes(&mut equations, first, drive, correction, scales.fixes_m);
+        add_odometry(&mut equations, first, drive, turned.correction);
+        add_fixes(&mut equations, first, drive, turned, &located.fixes[index], scales.fixes_m);
     }
-    // The scale of a residual against a station needs the station's place now: the mean of its sightings.
-    let residuals = residuals_across(corrections, sightings, stations);
-    for (sighting, residual) in sightings.iter().zip(residuals) {
-        let correction = &corrections[sighting.drive];
-        let mut row =
-            row_across(layout.first(sighting.drive), correction, &sighting.map, sighting.arc_m, &sighting.normal);
-        let place = correction.apply(&sighting.map, sighting.arc_m).coords.xy().dot(&sighting.normal);
+    let moving = sightings.iter().zip(&located.sightings);
+    let moving = moving.map(|(sighting, between)| turned[sighting.drive].moving(&sighting.map, *between));
+    let moving: Vec<Moving> = moving.collect();
+    // The scale of a residual against a station needs the station's place now: the median of its sightings.
+    let places = sightings.iter().zip(&moving).map(|(sighting, moving)| moving.place.dot(&sighting.normal));
+    let places: Vec<f64> = places.collect();
+    let residuals = residuals(&places, sightings.iter().map(|sighting| sighting.across), stations);
+    for (((sighting, moving), place), residual) in sightings.iter().zip(&moving).zip(places).zip(residuals) {
+        let mut row = moving.row_along(layout.first(sighting.drive), &sighting.normal);
         let value = match sighting.across {
             Target::Fixed(target) => target - place,
             Target::Station(station) => {
@@ -263,21 +327,24 @@ fn add_fixes(
     equations: &mut impl Equations,
     first: usize,
     drive: &Restraints,
-    correction: &Correction,
+    turned: &Turned<'_>,
+    located: &[Between],
     robust_scale_m: f64,
 ) {
     if drive.fixes.is_empty() {
         return;
     }
-    let bias = first + 3 * correction.knots.len();
+    let bias = first + 3 * turned.correction.knots.len();
+    let moving = drive.fixes.iter().zip(located).map(|(fix, between)| turned.moving(&fix.map, *between));
+    let moving: Vec<Moving> = moving.collect();
     let offsets: Vec<Vector2<f64>> =
-        drive.fixes.iter().map(|fix| (fix.shared - correction.apply(&fix.map, fix.arc_m)).xy()).collect();
+        drive.fixes.iter().zip(&moving).map(|(fix, moving)| fix.shared.coords.xy() - moving.place).collect();
     let common = median(&offsets);
-    for (fix, offset) in drive.fixes.iter().zip(&offsets) {
+    for ((fix, moving), offset) in drive.fixes.iter().zip(&moving).zip(&offsets) {
         let [sigma_m, _] = fix.sigma_m;
         let weight = robust_weight((offset - common).norm(), robust_scale_m) / (sigma_m * sigma_m);
         for (axis, bias, value) in [(Vector2::x(), bias, offset.x), (Vector2::y(), bias + 1, offset.y)] {
-            let mut row = row_across(first, correction, &fix.map, fix.arc_m, &axis);
+            let mut row = moving.row_along(first, &axis);
             row.push(bias, 1.0);
             equations.add(row.entries(), value, weight);
         }
@@ -298,13 +365,6 @@ fn median(offsets: &[Vector2<f64>]) -> Vector2<f64> {
 }
 
 /// How far each sighting lies from its target; from the median of its station, where that is unknown.
-fn residuals_across(corrections: &[Correction], sightings: &[Sighting], stations: usize) -> Vec<f64> {
-    let places = sightings.iter().map(|sighting| {
-        corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).coords.xy().dot(&sighting.normal)
-    });
-    residuals(&places.collect::<Vec<f64>>(), sightings.iter().map(|sighting| sighting.across), stations)
-}
-
 fn residuals(places: &[f64], targets: impl Iterator<Item = Target> + Clone, stations: usize) -> Vec<f64> {
     let mut at_station: Vec<Vec<f64>> = vec![Vec::new(); stations];
     for (place, target) in places.iter().zip(targets.clone()) {
@@ -327,14 +387,8 @@ fn residuals(places: &[f64], targets: impl Iterator<Item = Target> + Clone, stat
     places.iter().zip(targets).map(residual).collect()
 }
 
-fn align_heights(
-    drives: &[&Restraints],
-    corrections: &mut [Correction],
-    sightings: &[Sighting],
-    stations: usize,
-    scales: RobustScales,
-    elimination: &mut Elimination,
-) {
+fn align_heights(problem: &Problem<'_>, corrections: &mut [Correction], elimination: &mut Elimination) {
+    let Problem { drives, sightings, located, stations, scales } = *problem;
     let layout = Layout::new(corrections, 1, 1, stations);
     let mut equations = layout.equations();
     for (index, (drive, correction)) in drives.iter().zip(corrections.iter()).enumerate() {
@@ -343,13 +397,15 @@ fn align_heights(
             let residual = (pair[1].shared.z - pair[0].shared.z) - (pair[1].map.z - pair[0].map.z);
             equations.add(&[(first + knot + 1, 1.0), (first + knot, -1.0)], -residual, 1.0 / step.height_m2);
         }
-        add_fixed_heights(&mut equations, first, drive, correction);
+        add_fixed_heights(&mut equations, first, drive, correction, &located.fixes[index]);
     }
-    let places: Vec<f64> =
-        sightings.iter().map(|sighting| corrections[sighting.drive].apply(&sighting.map, sighting.arc_m).z).collect();
+    let places = sightings.iter().zip(&located.sightings);
+    let places = places.map(|(sighting, between)| height(&corrections[sighting.drive], sighting.map.z, *between));
+    let places: Vec<f64> = places.collect();
     let residuals = residuals(&places, sightings.iter().map(|sighting| sighting.height), stations);
-    for ((sighting, place), residual) in sightings.iter().zip(&places).zip(residuals) {
-        let mut row = row_of_height(layout.first(sighting.drive), &corrections[sighting.drive], sighting.arc_m);
+    let seen = sightings.iter().zip(&located.sightings).zip(&places).zip(residuals);
+    for (((sighting, between), place), residual) in seen {
+        let mut row = row_of_height(layout.first(sighting.drive), *between);
         let value = match sighting.height {
             Target::Fixed(target) => target - place,
             Target::Station(station) => {
@@ -368,8 +424,14 @@ fn align_heights(
     }
 }
 
-fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Row {
-    let (knot, weight) = correction.locate(arc_m);
+/// Height under a correction: turns are about the vertical.
+fn height(correction: &Correction, map_z: f64, (knot, weight): Between) -> f64 {
+    let at = |knot: usize| correction.knots[knot].shared.z + (map_z - correction.knots[knot].map.z);
+    let before = at(knot);
+    if weight == 0.0 { before } else { before + (at(knot + 1) - before) * weight }
+}
+
+fn row_of_height(first: usize, (knot, weight): Between) -> Row {
     let mut row = Row::default();
     row.push(first + knot, 1.0 - weight);
     if weight > 0.0 {
@@ -378,16 +440,22 @@ fn row_of_height(first: usize, correction: &Correction, arc_m: f64) -> Row {
     row
 }
 
-fn add_fixed_heights(equations: &mut impl Equations, first: usize, drive: &Restraints, correction: &Correction) {
+fn add_fixed_heights(
+    equations: &mut impl Equations,
+    first: usize,
+    drive: &Restraints,
+    correction: &Correction,
+    located: &[Between],
+) {
     if drive.fixes.is_empty() {
         return;
     }
     let bias = first + correction.knots.len();
-    for fix in &drive.fixes {
+    for (fix, between) in drive.fixes.iter().zip(located) {
         let [_, sigma_m] = fix.sigma_m;
-        let mut row = row_of_height(first, correction, fix.arc_m);
+        let mut row = row_of_height(first, *between);
         row.push(bias, 1.0);
-        let offset = fix.shared.z - correction.apply(&fix.map, fix.arc_m).z;
+        let offset = fix.shared.z - height(correction, fix.map.z, *between);
         equations.add(row.entries(), offset, 1.0 / (sigma_m * sigma_m));
     }
     equations.add(&[(bias, 1.0)], 0.0, drive.bias_sigma_m[1].powi(-2));

@@ -5,7 +5,7 @@
 //!
 //! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
 //! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
-//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart).
+//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). What was made of the oldest is kept where only younger ones change ([`beginning`]).
 //! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
 //!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
@@ -53,6 +53,7 @@
 
 pub mod alignment;
 pub mod base;
+pub mod beginning;
 mod bridging;
 pub mod cell;
 mod chain;
@@ -83,11 +84,14 @@ pub mod trace;
 mod ways;
 
 pub use base::Base;
+pub use beginning::Beginning;
 pub use cell::CellId;
 pub use change::{ChangeKind, MapChange};
 pub use contribution::{Contribution, DriveId, PlacedBy, TrajectoryPoint};
 pub use correction::Correction;
-pub use fusion::{FusedDrive, FusedMap, are_enough_apart, by_seniority, fold, fuse, fuse_onto, split_to_fold};
+pub use fusion::{
+    FusedDrive, FusedMap, are_enough_apart, by_seniority, fold, fuse, fuse_from, fuse_onto, split_to_fold,
+};
 pub use line::{FusedLane, FusedLaneId, FusedPoint};
 pub use params::FleetParams;
 pub use trace::Trace;

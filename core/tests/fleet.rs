@@ -4,7 +4,9 @@ mod roads;
 
 use lanemap_core::{
     Category,
-    fleet::{Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_onto},
+    fleet::{
+        Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_from, fuse_onto,
+    },
 };
 use nalgebra::Vector2;
 use proptest::prelude::*;
@@ -106,6 +108,37 @@ fn folding_older_drives_moves_no_line_by_more_than_a_few_centimetres() {
     assert!((before - after).norm() < 0.15, "{before} {after}");
     let misfits = misfits_m(&folded, &road, after);
     assert!(quantile(&misfits, 0.95) <= 0.15);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 16, ..ProptestConfig::default() })]
+    #[test]
+    fn fusing_on_from_a_beginning_gives_the_map_of_all_to_the_bit(
+        seed in 0..1000_u64,
+        folded in prop_oneof![Just(0_usize), Just(3)],
+        (kept, so_far_m, arrive) in (0..5_usize, 60.0..140.0_f64, 0..2_usize),
+    ) {
+        let road = Road::bend(140.0);
+        let mut drives = Survey::of(&road, seed).drives(9);
+        // One that fits nowhere is laid once more at the end.
+        drives[4] = with_bias(drives[4].clone(), Vector2::new(0.0, 9.0));
+        let (params, anchor) = (FleetParams::default(), anchor());
+        let base = fold(&Base::default(), &by_seniority(&drives[..folded]), &anchor, &params);
+        let mut live: Vec<Contribution> = drives[folded..8].to_vec();
+        let last = live.len() - 1;
+        live[last] = stretch(&live[last], 0.0, so_far_m);
+        let (_, beginning) = fuse_from(None, &base, &by_seniority(&live), &anchor, &params, Some(kept));
+        let beginning = beginning.unwrap();
+        prop_assert_eq!(beginning.drives(), kept);
+        // The live one has grown, and another may have come.
+        live[last] = drives[7].clone();
+        live.extend(drives[8..8 + arrive].iter().cloned());
+        let now = by_seniority(&live);
+        let (map, further) = fuse_from(Some(&beginning), &base, &now, &anchor, &params, Some(kept + 1));
+        prop_assert_eq!(&map, &fuse_onto(&base, &now, &anchor, &params));
+        let (again, _) = fuse_from(further.as_ref(), &base, &now, &anchor, &params, None);
+        prop_assert_eq!(&map, &again);
+    }
 }
 
 #[test]

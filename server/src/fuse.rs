@@ -13,6 +13,7 @@
 //! fingerprint: it is kept, and a start fuses nothing again that has not changed.
 
 mod bases;
+mod beginnings;
 pub(crate) mod border;
 mod cell_record;
 pub mod events;

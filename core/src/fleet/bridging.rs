@@ -49,6 +49,17 @@ impl Parts {
         Self { parent: (0..=drives).collect(), drives: sizes.collect() }
     }
 
+    /// The same where the base, which is the last, has another number: drives between the two are alone.
+    pub(super) fn renumbered(&self, base: usize, to: usize) -> Self {
+        let mut renumbered = Self::new(to, self.drives[base]);
+        let number = |drive: usize| if drive == base { to } else { drive };
+        for drive in (0..base.min(to)).chain([base]) {
+            renumbered.parent[number(drive)] = number(self.parent[drive]);
+            renumbered.drives[number(drive)] = self.drives[drive];
+        }
+        renumbered
+    }
+
     /// The part of a drive.
     pub(super) fn of(&self, mut drive: usize) -> usize {
         while self.parent[drive] != drive {

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     alignment::{Eliminations, RobustScales, Sighting, Target, align, align_one},
     base::Base,
+    beginning::Beginning,
     bridging::{Parts, Placement},
     change::MapChange,
     continuity::run_on,
@@ -104,18 +105,46 @@ pub fn fold(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &Fle
     let prepared: Vec<PreparedDrive<'_>> =
         drives.iter().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
     let mut fusion = Fusion::new(base, &prepared, params);
-    fusion.run();
+    fusion.place_all(Laying::default(), None);
+    fusion.align_and_draw();
     fusion.into_base(base)
 }
 
 /// Fuses the drives that are kept apart onto a base.
 #[must_use]
 pub fn fuse_onto(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &FleetParams) -> FusedMap {
+    fuse_from(None, base, drives, anchor, params, None).0
+}
+
+/// As [`fuse_onto`], to the bit, going on from a beginning of the same base and the same first drives, if there is one. `keep` asks for
+/// the beginning before that drive; there is none before the beginning's own drives.
+#[must_use]
+pub fn fuse_from(
+    beginning: Option<&Beginning>,
+    base: &Base,
+    drives: &[&Contribution],
+    anchor: &Anchor,
+    params: &FleetParams,
+    keep: Option<usize>,
+) -> (FusedMap, Option<Beginning>) {
     let prepared: Vec<PreparedDrive<'_>> =
         drives.iter().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
     let mut fusion = Fusion::new(base, &prepared, params);
-    fusion.run();
-    fusion.into_map(base)
+    let laying = beginning.map_or_else(Laying::default, |beginning| fusion.go_on(beginning));
+    let kept = fusion.place_all(laying, keep);
+    fusion.align_and_draw();
+    (fusion.into_map(base), kept)
+}
+
+/// How far the laying of drives has come.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Laying {
+    /// How many have been laid, and how many passes they have.
+    pub(super) drives: usize,
+    passes: usize,
+    pieces: Pieces,
+    /// Drives that fit nowhere as yet, with their first passes.
+    later: Vec<(usize, usize)>,
 }
 
 /// Drives while they are fused.
@@ -163,8 +192,8 @@ impl<'a> Fusion<'a> {
         self.base.ways()
     }
 
-    fn run(&mut self) {
-        self.place_all();
+    /// Solves for all that were laid together, and makes the lines from that.
+    fn align_and_draw(&mut self) {
         for _ in 1..self.params.rounds {
             self.align_all();
             self.learn_receivers();
@@ -189,20 +218,24 @@ impl<'a> Fusion<'a> {
         all.enumerate().map(|(number, (drive, pass))| (drive, number, pass)).filter(move |(drive, ..)| placed[*drive])
     }
 
-    /// Lays every drive, pass by pass, on the lines of those before it; those that fit nowhere once more at the end.
-    fn place_all(&mut self) {
-        let mut pieces = Pieces::new();
-        let mut later = Vec::new();
-        let mut first_pass = 0;
-        for drive in 0..self.drives.len() {
-            if self.placed[drive] && !self.place_drive(drive, first_pass, &mut pieces, false) {
-                later.push((drive, first_pass));
+    /// Lays every drive, pass by pass, on the lines of those before it; those that fit nowhere once more at the end. The
+    /// beginning before the drive that is asked for.
+    fn place_all(&mut self, mut laying: Laying, keep: Option<usize>) -> Option<Beginning> {
+        let mut kept = None;
+        for drive in laying.drives..self.drives.len() {
+            if keep == Some(drive) {
+                kept = Some(self.beginning(&laying));
             }
-            first_pass += self.drives[drive].passes.len();
+            if self.placed[drive] && !self.place_drive(drive, laying.passes, &mut laying.pieces, false) {
+                laying.later.push((drive, laying.passes));
+            }
+            laying.passes += self.drives[drive].passes.len();
+            laying.drives += 1;
         }
-        for (drive, first_pass) in later {
-            self.placed[drive] = self.place_drive(drive, first_pass, &mut pieces, true);
+        for (drive, first_pass) in laying.later {
+            self.placed[drive] = self.place_drive(drive, first_pass, &mut laying.pieces, true);
         }
+        kept
     }
 
     /// Lays one drive on the lines and adds it to them; whether it was found.

@@ -351,6 +351,12 @@ impl Lines {
         }
     }
 
+    /// About how much memory they take, bytes.
+    pub(super) fn bytes(&self) -> usize {
+        let knots = self.lines.iter().flat_map(|line| &line.knots);
+        knots.map(|knot| size_of::<(Knot, Point3<f64>)>() + knot.witnesses.capacity() * size_of::<Witness>()).sum()
+    }
+
     /// Whether a stretch of one of two lines moved to the other.
     pub(super) fn are_old_and_new(&self, a: usize, b: usize) -> bool {
         self.lines[a].moved_from == Some(b) || self.lines[b].moved_from == Some(a)

@@ -3,14 +3,14 @@
 //! A base is a pure function of the drives in it, so one that is found under their fingerprint is the one that folding
 //! them anew would give. Those used last stay in memory; after a start each is made once more when its cell is dirty.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use lanemap_core::fleet::{
-    Base, CellId, Contribution, FleetParams, FusedMap, are_enough_apart, by_seniority, fold, fuse_onto, split_to_fold,
+    Base, CellId, Contribution, DriveId, FleetParams, FusedMap, are_enough_apart, by_seniority, fold, split_to_fold,
 };
 use quick_cache::sync::Cache;
 
-use super::cell_record::fingerprint;
+use super::{beginnings::Beginnings, cell_record::fingerprint};
 use crate::{
     journal::{
         JournalError,
@@ -26,11 +26,12 @@ const MOST_BASES: usize = 32;
 #[derive(Debug)]
 pub(super) struct Bases {
     known: Cache<(CellId, u64), Arc<Base>>,
+    beginnings: Beginnings,
 }
 
 impl Bases {
     pub(super) fn new() -> Self {
-        Self { known: Cache::new(MOST_BASES) }
+        Self { known: Cache::new(MOST_BASES), beginnings: Beginnings::new() }
     }
 
     /// Fuses a cell as `lanemap_core::fleet::fuse` does, and reads and folds no drive again that is in a base.
@@ -64,7 +65,10 @@ impl Bases {
             self.known.insert((cell, print_of(&ordered[..folded])), Arc::clone(&base));
             rest = younger;
         }
-        Ok(fuse_onto(&base, rest, &anchor, params))
+        let by_drive: BTreeMap<DriveId, ContributionFact> =
+            ordered[folded..].iter().map(|(fact, _)| (fact.drive, *fact)).collect();
+        let facts = rest.iter().filter_map(|drive| by_drive.get(&drive.drive).copied()).collect();
+        Ok(self.beginnings.fuse(cell, (print_of(&ordered[..folded]), &base), (facts, rest), params))
     }
 
     /// The bases that are known, that of the most drives first, with their numbers.
@@ -83,7 +87,7 @@ fn print_of(ordered: &[(ContributionFact, SessionId)]) -> u64 {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use lanemap_core::{
@@ -94,10 +98,10 @@ mod tests {
 
     use super::*;
 
-    const CELL: (u32, u32) = (8_718, 5_685);
+    pub(in crate::fuse) const CELL: (u32, u32) = (8_718, 5_685);
 
     /// A drive of 90 m to the east with one line at its left.
-    fn drive(number: u64) -> Contribution {
+    pub(in crate::fuse) fn drive(number: u64) -> Contribution {
         let anchor = CellId::new(CELL.0, CELL.1).unwrap().anchor();
         let way = (0..30_i32).map(|i| f64::from(i) * 3.0);
         let trajectory = way.clone().map(|x| {

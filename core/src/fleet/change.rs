@@ -62,138 +62,136 @@ pub struct MapChange {
 const MOVED_M: f64 = 2.5;
 /// Least number of knots of an event.
 const LEAST_KNOTS: usize = 4;
+/// The same of what is left of a stretch that went, of which the rest moved: less is the end of the move.
+const LEAST_KNOTS_BESIDE_MOVED: usize = 8;
 /// Knots that may be missing from an event without cutting it in two.
 const BRIDGED_KNOTS: usize = 2;
 
-/// A run of knots of one line that turned alike.
-struct Stretch {
+/// A knot of which something is believed, with the drive by which it came to be.
+#[derive(Clone, Copy, Debug)]
+struct Told {
+    knot: usize,
+    noticed: Speaker,
+    probability: f64,
+}
+
+/// A run of knots of one line that changed alike.
+#[derive(Clone, Debug)]
+struct Stretch<K> {
     line: usize,
-    turn: Turn,
-    first: usize,
-    last: usize,
-    /// With whom each of its knots came to be believed.
-    noticed: Vec<Speaker>,
-    probability_sum: f64,
+    kind: K,
+    told: Vec<Told>,
 }
 
 impl Fusion<'_> {
     /// Every change that is believed, in the order in which they came to be.
     pub(super) fn changes(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>]) -> Vec<MapChange> {
-        let mut stretches = Vec::new();
-        for (line, beliefs) in beliefs.iter().enumerate() {
-            stretches.extend(stretches_of(line, beliefs));
-        }
-        stretches.retain(|stretch| stretch.noticed.len() >= LEAST_KNOTS);
-        let mut changes = events(&self.lines, &stretches);
+        let turned = beliefs.iter().enumerate().flat_map(|(line, beliefs)| turned(line, beliefs));
+        let mut changes = events(&self.lines, &turned.collect::<Vec<_>>());
         for (line, (beliefs, paints)) in beliefs.iter().zip(paints).enumerate() {
-            changes.extend(repaints(&self.lines, line, beliefs, paints));
+            changes.extend(
+                repainted(line, beliefs, paints).iter().map(|stretch| stretch.change(&self.lines, stretch.kind)),
+            );
         }
         changes.sort_by_key(|change| (change.noticed, change.noticed_by, change.lane));
         changes
     }
 }
 
-fn stretches_of(line: usize, beliefs: &[Belief]) -> Vec<Stretch> {
-    let mut stretches: Vec<Stretch> = Vec::new();
-    for (knot, belief) in beliefs.iter().enumerate() {
-        let Some((turn, noticed)) = belief.change else { continue };
+/// Stretches of a line that came or went.
+fn turned(line: usize, beliefs: &[Belief]) -> Vec<Stretch<Turn>> {
+    let told = beliefs.iter().enumerate().filter_map(|(knot, belief)| {
+        let (turn, noticed) = belief.change?;
         let probability = if turn == Turn::Came { belief.probability } else { 1.0 - belief.probability };
+        Some((turn, Told { knot, noticed, probability }))
+    });
+    stretches(line, told)
+}
+
+/// Stretches of a line that are there and were repainted.
+fn repainted(line: usize, beliefs: &[Belief], paints: &[Paint]) -> Vec<Stretch<ChangeKind>> {
+    let told = beliefs.iter().zip(paints).enumerate().filter_map(|(knot, (belief, paint))| {
+        let repaint = paint.change.filter(|_| belief.is_shown())?;
+        let kind = ChangeKind::Repainted { from: repaint.from, to: repaint.to };
+        Some((kind, Told { knot, noticed: repaint.noticed, probability: repaint.probability }))
+    });
+    stretches(line, told)
+}
+
+/// Runs of knots, given in their order, that changed alike.
+fn stretches<K: Copy + PartialEq>(line: usize, told: impl Iterator<Item = (K, Told)>) -> Vec<Stretch<K>> {
+    let mut stretches: Vec<Stretch<K>> = Vec::new();
+    for (kind, told) in told {
         match stretches.last_mut() {
-            Some(open) if open.turn == turn && knot - open.last <= BRIDGED_KNOTS + 1 => {
-                open.last = knot;
-                open.noticed.push(noticed);
-                open.probability_sum += probability;
-            }
-            _ => stretches.push(Stretch {
-                line,
-                turn,
-                first: knot,
-                last: knot,
-                noticed: vec![noticed],
-                probability_sum: probability,
-            }),
+            Some(open) if open.kind == kind && told.knot - open.last() <= BRIDGED_KNOTS + 1 => open.told.push(told),
+            _ => stretches.push(Stretch { line, kind, told: vec![told] }),
         }
     }
+    stretches.retain(|stretch| stretch.told.len() >= LEAST_KNOTS);
     stretches
 }
 
-/// Events of stretches; one that went beside one that came is one event.
-fn events(lines: &Lines, stretches: &[Stretch]) -> Vec<MapChange> {
-    let came: Vec<&Stretch> = stretches.iter().filter(|stretch| stretch.turn == Turn::Came).collect();
-    let went: Vec<&Stretch> = stretches.iter().filter(|stretch| stretch.turn == Turn::Went).collect();
-    let mut moved_from = vec![false; went.len()];
+/// Events of stretches that came or went. What went beside one that came is one event with it: it moved.
+fn events(lines: &Lines, turned: &[Stretch<Turn>]) -> Vec<MapChange> {
+    let (came, went): (Vec<&Stretch<Turn>>, Vec<&Stretch<Turn>>) =
+        turned.iter().partition(|stretch| stretch.kind == Turn::Came);
     let mut changes = Vec::new();
+    let mut moved: Vec<&Stretch<Turn>> = Vec::new();
     for stretch in came {
-        let beside = went.iter().enumerate().filter(|(index, _)| !moved_from[*index]);
-        let beside = beside.filter_map(|(index, old)| Some((index, distance_m(lines, stretch, old)?)));
-        let nearest = beside.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, by_m)| *by_m <= MOVED_M);
-        changes.push(match nearest {
-            Some((index, by_m)) => {
-                moved_from[index] = true;
-                change(lines, stretch, ChangeKind::Moved { by_m })
-            }
-            None => change(lines, stretch, ChangeKind::Appeared),
-        });
+        let by_m = stretch.moved_by_m(lines, &went);
+        changes.push(stretch.change(lines, by_m.map_or(ChangeKind::Appeared, |by_m| ChangeKind::Moved { by_m })));
+        moved.extend(by_m.map(|_| stretch));
     }
-    let gone = went.iter().zip(&moved_from).filter(|(_, moved)| !**moved);
-    changes.extend(gone.map(|(stretch, _)| change(lines, stretch, ChangeKind::Vanished)));
+    for stretch in went {
+        let is_gone = |told: &&Told| {
+            let place = &lines.lines[stretch.line].points[told.knot];
+            moved.iter().all(|new| new.distance_m(lines, place) > MOVED_M)
+        };
+        let gone = stretch.told.iter().filter(is_gone).map(|told| (Turn::Went, *told));
+        let gone = stretches(stretch.line, gone);
+        let is_end = |gone: &&Stretch<Turn>| gone.told.len() < stretch.told.len().min(LEAST_KNOTS_BESIDE_MOVED);
+        let gone = gone.iter().filter(|gone| !is_end(gone));
+        changes.extend(gone.map(|gone| gone.change(lines, ChangeKind::Vanished)));
+    }
     changes
 }
 
-fn change(lines: &Lines, stretch: &Stretch, kind: ChangeKind) -> MapChange {
-    let line = &lines.lines[stretch.line];
-    let mut speakers = stretch.noticed.clone();
-    speakers.sort_unstable();
-    // Its ends are told apart last: it is there once half of it is.
-    let (noticed, noticed_by) = speakers[speakers.len() / 2];
-    MapChange {
-        kind,
-        lane: line.id,
-        points: line.points[stretch.first..=stretch.last].to_vec(),
-        noticed,
-        noticed_by,
-        probability: stretch.probability_sum / stretch.noticed.len() as f64,
+impl<K> Stretch<K> {
+    fn last(&self) -> usize {
+        self.told[self.told.len() - 1].knot
     }
-}
 
-/// Where a line that is there was repainted.
-fn repaints(lines: &Lines, line: usize, beliefs: &[Belief], paints: &[Paint]) -> Vec<MapChange> {
-    let mut stretches: Vec<(ChangeKind, Stretch)> = Vec::new();
-    for (knot, (belief, paint)) in beliefs.iter().zip(paints).enumerate() {
-        let Some(repaint) = paint.change.filter(|_| belief.is_shown()) else { continue };
-        let kind = ChangeKind::Repainted { from: repaint.from, to: repaint.to };
-        match stretches.last_mut() {
-            Some((open, stretch)) if *open == kind && knot - stretch.last <= BRIDGED_KNOTS + 1 => {
-                stretch.last = knot;
-                stretch.noticed.push(repaint.noticed);
-                stretch.probability_sum += repaint.probability;
-            }
-            _ => stretches.push((
-                kind,
-                Stretch {
-                    line,
-                    turn: Turn::Came,
-                    first: knot,
-                    last: knot,
-                    noticed: vec![repaint.noticed],
-                    probability_sum: repaint.probability,
-                },
-            )),
+    fn points<'a>(&self, lines: &'a Lines) -> &'a [Point3<f64>] {
+        &lines.lines[self.line].points[self.told[0].knot..=self.last()]
+    }
+
+    fn change(&self, lines: &Lines, kind: ChangeKind) -> MapChange {
+        let mut speakers: Vec<Speaker> = self.told.iter().map(|told| told.noticed).collect();
+        speakers.sort_unstable();
+        // Its ends are told apart last: it is there once half of it is.
+        let (noticed, noticed_by) = speakers[speakers.len() / 2];
+        MapChange {
+            kind,
+            lane: lines.lines[self.line].id,
+            points: self.points(lines).to_vec(),
+            noticed,
+            noticed_by,
+            probability: self.told.iter().map(|told| told.probability).sum::<f64>() / self.told.len() as f64,
         }
     }
-    stretches.retain(|(_, stretch)| stretch.noticed.len() >= LEAST_KNOTS);
-    stretches.iter().map(|(kind, stretch)| change(lines, stretch, *kind)).collect()
-}
 
-/// Mean distance of the knots of one stretch from another; `None` where less than half have it near.
-fn distance_m(lines: &Lines, a: &Stretch, b: &Stretch) -> Option<f64> {
-    let points = |stretch: &Stretch| &lines.lines[stretch.line].points[stretch.first..=stretch.last];
-    let distances = points(a).iter().map(|point| {
-        let chords = points(b).windows(2).map(|pair| from_chord_m(point, &pair[0], &pair[1]));
-        chords.fold(f64::INFINITY, f64::min)
-    });
-    let near: Vec<f64> = distances.filter(|distance| *distance <= MOVED_M).collect();
-    (2 * near.len() >= a.noticed.len()).then(|| near.iter().sum::<f64>() / near.len() as f64)
+    /// Mean distance of its knots from stretches that went; `None` where less than half have one near.
+    fn moved_by_m(&self, lines: &Lines, went: &[&Self]) -> Option<f64> {
+        let nearest = |place| went.iter().map(|old| old.distance_m(lines, place)).fold(f64::INFINITY, f64::min);
+        let near: Vec<f64> = self.points(lines).iter().map(nearest).filter(|by_m| *by_m <= MOVED_M).collect();
+        (2 * near.len() >= self.told.len()).then(|| near.iter().sum::<f64>() / near.len() as f64)
+    }
+
+    /// Distance of a place from it, metres.
+    fn distance_m(&self, lines: &Lines, place: &Point3<f64>) -> f64 {
+        let chords = self.points(lines).windows(2);
+        chords.map(|pair| from_chord_m(place, &pair[0], &pair[1])).fold(f64::INFINITY, f64::min)
+    }
 }
 
 /// Distance of a place from a chord, horizontally.

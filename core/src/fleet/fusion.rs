@@ -376,6 +376,7 @@ impl<'a> Fusion<'a> {
             line.settle(self.params);
             run_on(line, self.params);
         }
+        self.lines.index();
         self.part_moved(&mut pieces);
         self.lines.index();
     }

@@ -117,8 +117,8 @@ pub(super) struct Line {
     posterior: Vec<f64>,
     /// What is known of it from drives that were folded.
     pub(super) record: LineRecord,
-    /// The line from which a stretch moved to here.
-    pub(super) moved_from: Option<usize>,
+    /// The lines from which a stretch moved to here.
+    pub(super) moved_from: BTreeSet<usize>,
 }
 
 /// A knot of a line while it is made.
@@ -184,7 +184,7 @@ impl Line {
             category_votes: vec![0.0; categories],
             posterior: vec![1.0 / categories as f64; categories],
             record: LineRecord::default(),
-            moved_from: None,
+            moved_from: BTreeSet::new(),
         }
     }
 
@@ -359,7 +359,7 @@ impl Lines {
 
     /// Whether a stretch of one of two lines moved to the other.
     pub(super) fn are_old_and_new(&self, a: usize, b: usize) -> bool {
-        self.lines[a].moved_from == Some(b) || self.lines[b].moved_from == Some(a)
+        self.lines[a].moved_from.contains(&b) || self.lines[b].moved_from.contains(&a)
     }
 
     /// Calls `visit` with line, knot and place of every knot within about a radius of a place, horizontally.

@@ -8,7 +8,8 @@
 //!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). What was made of the oldest is kept where only younger ones change ([`beginning`]).
 //! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
 //!    a drive saw as one are joined (`growth`, `joining`).
-//! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky.
+//! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky; how far
+//!    receivers (`receivers`) and drives (`credibility`) are believed is learned on the way.
 //! 5. [`base`]: where drives crowd, the oldest are folded (`crowding`), so that a place costs no more the more often it is driven.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
 //!    (`persistence`, `moved`), the most likely history of each stretch (`history`), and that of its paint (`repainted`).
@@ -61,6 +62,7 @@ pub mod change;
 mod continuity;
 pub mod contribution;
 pub mod correction;
+mod credibility;
 mod crowding;
 pub mod fusion;
 mod georeferenced;

@@ -21,6 +21,7 @@ use super::{
     continuity::run_on,
     contribution::{Contribution, DriveId, PlacedBy},
     correction::Correction,
+    credibility::{DOUBTED, learned_doubts},
     crowding::first_crowd,
     georeferenced::UNBOUNDED_M,
     growth::{Growing, Pieces},
@@ -155,6 +156,8 @@ pub(super) struct Fusion<'a> {
     /// Of each drive, then of the base.
     pub(super) corrections: Vec<Correction>,
     restraints: Vec<Restraints>,
+    /// By what factor the variances of what each drive says are too small.
+    doubts: Vec<f64>,
     eliminations: Eliminations,
     pub(super) placed: Vec<bool>,
     pub(super) lines: Lines,
@@ -181,10 +184,24 @@ impl<'a> Fusion<'a> {
         let restraints = drives.iter().map(|drive| drive.restraints.clone());
         let restraints = restraints.chain([base.restraints()]).collect();
         let eliminations = Eliminations::default();
+        let doubts = vec![1.0; drives.len()];
         let is_laid = vec![false; drives.len()];
         let parts = Parts::new(drives.len(), base.drives());
         let ways = base.ways().clone();
-        Self { drives, params, base, corrections, restraints, eliminations, placed, lines, ways, is_laid, parts }
+        Self {
+            drives,
+            params,
+            base,
+            corrections,
+            restraints,
+            doubts,
+            eliminations,
+            placed,
+            lines,
+            ways,
+            is_laid,
+            parts,
+        }
     }
 
     /// Where folded drives went.
@@ -198,6 +215,7 @@ impl<'a> Fusion<'a> {
             self.align_all();
             self.learn_receivers();
             self.settle_lines();
+            self.learn_credibility();
         }
         self.align_all();
         self.draw_lines();
@@ -353,6 +371,22 @@ impl<'a> Fusion<'a> {
         }
     }
 
+    /// Believes drives less, from the next alignment on, whose lanes lie farther beside those of others than is usual.
+    fn learn_credibility(&mut self) {
+        let learned = learned_doubts(&self.lines.lines, self.drives.len());
+        let by: Vec<f64> = learned.iter().zip(&self.doubts).map(|(now, before)| now / before).collect();
+        self.raise_variances(&by);
+        self.doubts = learned;
+    }
+
+    /// Multiplies the variance of all that each drive says by a factor.
+    fn raise_variances(&mut self, by: &[f64]) {
+        let knots = self.lines.lines.iter_mut().flat_map(|line| &mut line.knots);
+        for witness in knots.flat_map(|knot| &mut knot.witnesses) {
+            witness.lateral_variance_m2 *= by.get(witness.drive).copied().unwrap_or(1.0);
+        }
+    }
+
     /// Moves the lines with their witnesses, whose drives were corrected anew.
     fn settle_lines(&mut self) {
         for line in &mut self.lines.lines {
@@ -369,9 +403,13 @@ impl<'a> Fusion<'a> {
         let base = self.drives.len();
         self.lines = self.base.lines(base, &self.corrections[base]);
         let mut pieces = Pieces::new();
-        for (drive, number, pass) in self.passes() {
+        let (doubted, believed): (Vec<_>, Vec<_>) =
+            self.passes().partition(|(drive, ..)| self.doubts[*drive] >= DOUBTED);
+        for (drive, number, pass) in believed.into_iter().chain(doubted) {
             self.grow(drive, number, pass, &mut pieces);
         }
+        let doubts = self.doubts.clone();
+        self.raise_variances(&doubts);
         for line in &mut self.lines.lines {
             line.settle(self.params);
             run_on(line, self.params);

@@ -29,7 +29,7 @@ use crate::{
     spline::curve::Curve,
 };
 
-/// Name of a line in the shared map: its oldest witness, so that it is the same in any order of arrival.
+/// Name of a line in the shared map: its oldest witness that is believed, so that it is the same in any order of arrival.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct FusedLaneId {
     /// Start of the oldest drive that saw it.

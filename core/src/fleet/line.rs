@@ -132,9 +132,15 @@ pub(super) struct Knot {
 impl Knot {
     /// Number of drives that saw it.
     pub(super) fn drives(&self) -> u32 {
-        let apart = self.witnesses.iter().filter(|witness| witness.pass != BASE).map(|witness| witness.drive);
-        let apart: BTreeSet<usize> = apart.collect();
-        self.record.drives + u32::try_from(apart.len()).unwrap_or(u32::MAX)
+        let apart = || self.witnesses.iter().filter(|witness| witness.pass != BASE).map(|witness| witness.drive);
+        // They mostly come in their order.
+        let count = if apart().is_sorted() {
+            let mut last = None;
+            apart().filter(|drive| last.replace(*drive) != Some(*drive)).count()
+        } else {
+            apart().collect::<BTreeSet<usize>>().len()
+        };
+        self.record.drives + u32::try_from(count).unwrap_or(u32::MAX)
     }
 }
 
@@ -342,11 +348,17 @@ fn weighted_median(values: &[(f64, f64)]) -> f64 {
 impl Lines {
     /// Finds knots by place again, after lines moved or grew.
     pub(super) fn index(&mut self) {
-        self.grid.clear();
+        // What they hold is used again.
+        for knots in self.grid.values_mut() {
+            knots.clear();
+        }
         for (number, line) in self.lines.iter().enumerate() {
-            for (knot, point) in line.points.iter().enumerate() {
+            let knots = line.points.iter().map(|point| cell(point.x, point.y)).enumerate();
+            let knots: Vec<(usize, (i32, i32))> = knots.collect();
+            for run in knots.chunk_by(|a, b| a.1 == b.1) {
                 #[expect(clippy::cast_possible_truncation, reason = "a map has fewer than 2^32 lines and knots")]
-                self.grid.entry(cell(point.x, point.y)).or_default().push((number as u32, knot as u32));
+                let own = run.iter().map(|(knot, _)| (number as u32, *knot as u32));
+                self.grid.entry(run[0].1).or_default().extend(own);
             }
         }
     }

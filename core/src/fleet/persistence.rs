@@ -15,7 +15,7 @@ use super::{
     correction::Correction,
     fusion::Fusion,
     history::{Belief, histories},
-    line::Lines,
+    line::{BASE, Knot, Lines},
     prepared::{PreparedPass, normal_of},
 };
 use crate::{frame::TimestampNs, sensor::Sensor};
@@ -66,12 +66,16 @@ pub(super) struct Hearing {
 }
 
 /// How a pass had a knot in view.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct View {
     /// From how many places of its way.
     places: u16,
     /// Least distance to the side, metres.
     side_m: f32,
+}
+
+impl View {
+    const NONE: Self = Self { places: 0, side_m: f32::MAX };
 }
 
 /// A hearing before its chance is known.
@@ -89,19 +93,25 @@ impl Fusion<'_> {
         let mut sights: Vec<Vec<Vec<Sight>>> =
             self.lines.lines.iter().map(|line| vec![Vec::new(); line.knots.len()]).collect();
         let mut elsewhere: Vec<Vec<usize>> = self.lines.lines.iter().map(|line| vec![0; line.knots.len()]).collect();
+        let mut look = Look::new(&self.lines);
+        let seen = seen_by_pass(&self.lines);
         for (drive, number, pass) in self.passes() {
             let contribution = self.drives[drive].contribution;
             speakers.resize(number + 1, contribution.seniority());
-            let views = views(pass, &contribution.sensor, &self.corrections[drive], &self.lines);
-            self.look(number, &views, &mut sights, &mut elsewhere);
+            let seen = seen.get(number).map(Vec::as_slice).unwrap_or_default();
+            look.take(pass, &contribution.sensor, &self.corrections[drive], seen);
+            look.tell(number, seen, &mut sights, &mut elsewhere);
         }
         let chances = learned_chances(&sights);
+        let drives = self.lines.lines.iter().map(|line| line.knots.iter().map(Knot::drives).collect());
+        let drives: Vec<Vec<u32>> = drives.collect();
         let beliefs = sights.iter().enumerate().map(|(index, sights)| {
             let line = &self.lines.lines[index];
             let worn = worn(sights, &chances);
             let hearings: Vec<Vec<Hearing>> = (0..sights.len())
                 .map(|knot| {
-                    let ghost = if self.is_beside_a_stronger_line(index, knot) { GHOST_BESIDE } else { GHOST };
+                    let is_beside = self.is_beside_a_stronger_line(index, knot, &drives);
+                    let ghost = if is_beside { GHOST_BESIDE } else { GHOST };
                     let hearing = |sight: &Sight| Hearing {
                         pass: sight.pass,
                         seen: sight.seen,
@@ -124,52 +134,18 @@ impl Fusion<'_> {
         beliefs.collect()
     }
 
-    /// What one pass saw and missed, and what it has on another line.
-    fn look(&self, number: usize, views: &[Vec<View>], sights: &mut [Vec<Vec<Sight>>], elsewhere: &mut [Vec<usize>]) {
-        let Ok(pass) = u32::try_from(number) else { return };
-        for (index, (line, views)) in self.lines.lines.iter().zip(views).enumerate() {
-            for (knot, (at, view)) in line.knots.iter().zip(views).enumerate() {
-                let seen = at.witnesses.iter().any(|witness| witness.pass == number);
-                if !seen && view.places < LEAST_VIEWS {
-                    continue;
-                }
-                if !seen && self.sees_paint_beside(number, index, knot) {
-                    elsewhere[index][knot] += 1;
-                } else {
-                    sights[index][knot].push(Sight { pass, seen, class: class_of(*view) });
-                }
-            }
-        }
-    }
-
-    /// Whether more drives saw a line so near a knot that there is hardly room for two.
-    fn is_beside_a_stronger_line(&self, line: usize, knot: usize) -> bool {
+    /// Whether more drives saw a line so near a knot that there is hardly room for two; by the drives that saw each knot.
+    fn is_beside_a_stronger_line(&self, line: usize, knot: usize, drives: &[Vec<u32>]) -> bool {
         let place = self.lines.lines[line].points[knot];
         let normal = normal_of(&self.lines.lines[line].tangent(knot));
-        let own = self.lines.lines[line].knots[knot].drives();
+        let own = drives[line][knot];
         let mut beside = false;
         self.lines.for_each_knot_near(&place, NO_ROOM_M, |other, at, there| {
             let across_m = (there - place).xy().dot(&normal).abs();
             let is_near = (there - place).xy().norm() < NO_ROOM_M && across_m > SAME_PAINT_M;
             if !beside && is_near && other != line && !self.lines.are_old_and_new(line, other) {
-                beside = self.lines.lines[other].knots[at].drives() > own;
+                beside = drives[other][at] > own;
             }
-        });
-        beside
-    }
-
-    /// Whether a pass has the paint of a knot on another line.
-    fn sees_paint_beside(&self, number: usize, line: usize, knot: usize) -> bool {
-        let place = self.lines.lines[line].points[knot];
-        let normal = normal_of(&self.lines.lines[line].tangent(knot));
-        let mut beside = false;
-        self.lines.for_each_knot_near(&place, 3.0, |other, at, _| {
-            if beside || other == line || self.lines.are_old_and_new(line, other) {
-                return;
-            }
-            let own = self.lines.lines[other].knots[at].witnesses.iter().filter(|witness| witness.pass == number);
-            let mut offsets = own.map(|witness| (witness.shared - place).xy());
-            beside = offsets.any(|offset| offset.dot(&normal).abs() < SAME_PAINT_M && offset.norm() < SAME_KNOT_M);
         });
         beside
     }
@@ -227,29 +203,130 @@ fn worn(sights: &[Vec<Sight>], chances: &[f64]) -> Vec<f64> {
     (0..sights.len()).map(around).collect()
 }
 
-/// How a pass had each knot of each line in view.
-fn views(pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Correction, lines: &Lines) -> Vec<Vec<View>> {
-    let mut of: Vec<Vec<View>> =
-        lines.lines.iter().map(|line| vec![View { places: 0, side_m: f32::MAX }; line.points.len()]).collect();
-    for point in pass.way {
-        let place = correction.apply(&point.position, point.arc_m);
-        let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
-        let middle = place + Vector3::new(cos, sin, 0.0) * (0.5 * (AHEAD_M.start + AHEAD_M.end));
-        lines.for_each_knot_near(&middle, 20.0, |line, knot, at: &Point3<f64>| {
-            let offset = at - place;
-            let ahead = cos * offset.x + sin * offset.y;
-            let left = -sin * offset.x + cos * offset.y;
-            if !AHEAD_M.contains(&ahead) || left.abs() > SIDE_M || offset.z.abs() > 3.0 {
+/// A knot that a pass saw, with the place of its witness among those of the knot.
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    line: u32,
+    knot: u32,
+    witness: u32,
+}
+
+/// The knots that each pass saw.
+#[expect(clippy::cast_possible_truncation, reason = "a map has fewer than 2^32 lines, knots and witnesses")]
+fn seen_by_pass(lines: &Lines) -> Vec<Vec<Seen>> {
+    let mut by_pass: Vec<Vec<Seen>> = Vec::new();
+    for (number, line) in lines.lines.iter().enumerate() {
+        for (knot, at) in line.knots.iter().enumerate() {
+            for (index, witness) in at.witnesses.iter().enumerate().filter(|(_, witness)| witness.pass != BASE) {
+                if by_pass.len() <= witness.pass {
+                    by_pass.resize(witness.pass + 1, Vec::new());
+                }
+                let seen = Seen { line: number as u32, knot: knot as u32, witness: index as u32 };
+                by_pass[witness.pass].push(seen);
+            }
+        }
+    }
+    by_pass
+}
+
+/// What one pass had in view and saw: a pass comes to few of the knots of a town, and only those are looked at.
+struct Look<'a> {
+    lines: &'a Lines,
+    /// Number of the first knot of each line among all.
+    first: Vec<usize>,
+    /// Of each knot.
+    views: Vec<View>,
+    own: Vec<Option<u32>>,
+    /// Knots in view.
+    in_view: Vec<(usize, usize)>,
+}
+
+impl<'a> Look<'a> {
+    fn new(lines: &'a Lines) -> Self {
+        let mut knots = 0;
+        let first = lines.lines.iter().map(|line| {
+            knots += line.points.len();
+            knots - line.points.len()
+        });
+        let first = first.collect();
+        Self { lines, first, views: vec![View::NONE; knots], own: vec![None; knots], in_view: Vec::new() }
+    }
+
+    fn number(&self, line: usize, knot: usize) -> usize {
+        self.first[line] + knot
+    }
+
+    /// Looks with the eyes of a pass.
+    fn take(&mut self, pass: &PreparedPass<'_>, sensor: &Sensor, correction: &Correction, seen: &[Seen]) {
+        for Seen { line, knot, witness } in seen {
+            let number = self.number(*line as usize, *knot as usize);
+            self.own[number] = Some(*witness);
+        }
+        for point in pass.way {
+            let place = correction.apply(&point.position, point.arc_m);
+            let (sin, cos) = (point.yaw_rad + correction.yaw_rad(point.arc_m)).sin_cos();
+            let middle = place + Vector3::new(cos, sin, 0.0) * (0.5 * (AHEAD_M.start + AHEAD_M.end));
+            self.lines.for_each_knot_near(&middle, 20.0, |line, knot, at: &Point3<f64>| {
+                let offset = at - place;
+                let ahead = cos * offset.x + sin * offset.y;
+                let left = -sin * offset.x + cos * offset.y;
+                if !AHEAD_M.contains(&ahead) || left.abs() > SIDE_M || offset.z.abs() > 3.0 {
+                    return;
+                }
+                if sensor.sees(&Point3::new(ahead, left, offset.z)) && !point.hides(ahead, left, sensor) {
+                    let view = &mut self.views[self.first[line] + knot];
+                    if view.places == 0 {
+                        self.in_view.push((line, knot));
+                    }
+                    view.places += 1;
+                    #[expect(clippy::cast_possible_truncation, reason = "metres to the side")]
+                    let left_m = left.abs() as f32;
+                    view.side_m = view.side_m.min(left_m);
+                }
+            });
+        }
+    }
+
+    /// Tells what the pass saw and missed, and what it has on another line, and forgets it.
+    fn tell(&mut self, number: usize, seen: &[Seen], sights: &mut [Vec<Vec<Sight>>], elsewhere: &mut [Vec<usize>]) {
+        let Ok(pass) = u32::try_from(number) else { return };
+        for Seen { line, knot, .. } in seen {
+            let (line, knot) = (*line as usize, *knot as usize);
+            let class = class_of(self.views[self.number(line, knot)]);
+            sights[line][knot].push(Sight { pass, seen: true, class });
+        }
+        for (line, knot) in &self.in_view {
+            let number = self.number(*line, *knot);
+            if self.own[number].is_some() || self.views[number].places < LEAST_VIEWS {
+                continue;
+            }
+            if self.sees_paint_beside(*line, *knot) {
+                elsewhere[*line][*knot] += 1;
+            } else {
+                sights[*line][*knot].push(Sight { pass, seen: false, class: class_of(self.views[number]) });
+            }
+        }
+        for (line, knot) in self.in_view.drain(..) {
+            self.views[self.first[line] + knot] = View::NONE;
+        }
+        for Seen { line, knot, .. } in seen {
+            self.own[self.first[*line as usize] + *knot as usize] = None;
+        }
+    }
+
+    /// Whether the pass has the paint of a knot on another line.
+    fn sees_paint_beside(&self, line: usize, knot: usize) -> bool {
+        let place = self.lines.lines[line].points[knot];
+        let normal = normal_of(&self.lines.lines[line].tangent(knot));
+        let mut beside = false;
+        self.lines.for_each_knot_near(&place, 3.0, |other, at, _| {
+            if beside || other == line || self.lines.are_old_and_new(line, other) {
                 return;
             }
-            if sensor.sees(&Point3::new(ahead, left, offset.z)) && !point.hides(ahead, left, sensor) {
-                let view = &mut of[line][knot];
-                view.places += 1;
-                #[expect(clippy::cast_possible_truncation, reason = "metres to the side")]
-                let left_m = left.abs() as f32;
-                view.side_m = view.side_m.min(left_m);
-            }
+            let Some(witness) = self.own[self.number(other, at)] else { return };
+            let offset = (self.lines.lines[other].knots[at].witnesses[witness as usize].shared - place).xy();
+            beside = offset.dot(&normal).abs() < SAME_PAINT_M && offset.norm() < SAME_KNOT_M;
         });
+        beside
     }
-    of
 }

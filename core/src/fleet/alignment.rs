@@ -250,8 +250,12 @@ impl Moving {
         for (knot, weight, by_yaw) in [(knot, 1.0 - weight, self.by_yaw[0]), (knot + 1, weight, self.by_yaw[1])] {
             if weight > 0.0 {
                 let at = first + 3 * knot;
-                row.push(at, weight * axis.x);
-                row.push(at + 1, weight * axis.y);
+                for (unknown, part) in [(at, axis.x), (at + 1, axis.y)] {
+                    // Of an axis to the east or the north.
+                    if part != 0.0 {
+                        row.push(unknown, weight * part);
+                    }
+                }
                 row.push(at + 2, weight * by_yaw.dot(axis));
             }
         }

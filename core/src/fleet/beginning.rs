@@ -16,6 +16,8 @@ use super::{
 #[derive(Clone, Debug)]
 pub struct Beginning {
     laying: Laying,
+    /// Where GNSS and odometry alone put each of them.
+    by_gnss: Vec<Option<Correction>>,
     corrections: Vec<Correction>,
     placed: Vec<bool>,
     is_laid: Vec<bool>,
@@ -33,6 +35,11 @@ impl Beginning {
         self.laying.drives
     }
 
+    /// Where GNSS and odometry alone put a drive; `None` of one that is not in it.
+    pub(super) fn by_gnss(&self, drive: usize) -> Option<&Option<Correction>> {
+        self.by_gnss.get(drive)
+    }
+
     /// About how much memory it takes, bytes.
     #[must_use]
     pub fn bytes(&self) -> usize {
@@ -46,6 +53,7 @@ impl Fusion<'_> {
         let drives = ..laying.drives;
         Beginning {
             laying: laying.clone(),
+            by_gnss: self.drives[drives].iter().map(|drive| drive.by_gnss.clone()).collect(),
             corrections: self.corrections[drives].to_vec(),
             placed: self.placed[drives].to_vec(),
             is_laid: self.is_laid[drives].to_vec(),

@@ -128,13 +128,8 @@ impl<'a> CorrectionWalk<'a> {
         [knot, next].map(|knot| correction.knots[knot].yaw_rad.sin_cos())
     }
 
-    /// As [`Correction::apply`], and the direction in the shared frame, of length 1 to within the change of turn between two knots.
-    pub(super) fn apply(
-        &mut self,
-        point_map: &Point3<f64>,
-        direction: &Vector3<f64>,
-        arc_m: f64,
-    ) -> (Point3<f64>, Vector3<f64>) {
+    /// Goes to the knot before an arc length.
+    fn go_to(&mut self, arc_m: f64) {
         let knots = &self.correction.knots;
         let holds = |knot: usize| {
             (knot == 0 || knots[knot].arc_m <= arc_m) && (knot + 1 == knots.len() || arc_m < knots[knot + 1].arc_m)
@@ -143,6 +138,33 @@ impl<'a> CorrectionWalk<'a> {
             (self.knot, _) = self.correction.locate(arc_m);
             self.turns = Self::turns(self.correction, self.knot);
         }
+    }
+
+    /// As [`Correction::apply`].
+    pub(super) fn place(&mut self, point_map: &Point3<f64>, arc_m: f64) -> Point3<f64> {
+        self.go_to(arc_m);
+        let knots = &self.correction.knots;
+        let at = |knot: &CorrectionKnot, turn: (f64, f64)| knot.shared + turned(&(point_map - knot.map), turn);
+        let before = &knots[self.knot];
+        let place = at(before, self.turns[0]);
+        match knots.get(self.knot + 1) {
+            Some(next) if arc_m > before.arc_m => {
+                let share = (arc_m - before.arc_m) / (next.arc_m - before.arc_m);
+                place + (at(next, self.turns[1]) - place) * share
+            }
+            _ => place,
+        }
+    }
+
+    /// As [`Correction::apply`], and the direction in the shared frame, of length 1 to within the change of turn between two knots.
+    pub(super) fn apply(
+        &mut self,
+        point_map: &Point3<f64>,
+        direction: &Vector3<f64>,
+        arc_m: f64,
+    ) -> (Point3<f64>, Vector3<f64>) {
+        self.go_to(arc_m);
+        let knots = &self.correction.knots;
         let at = |knot: &CorrectionKnot, turn: (f64, f64)| {
             (knot.shared + turned(&(point_map - knot.map), turn), turned(direction, turn))
         };

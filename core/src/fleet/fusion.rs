@@ -20,7 +20,7 @@ use super::{
     change::MapChange,
     continuity::run_on,
     contribution::{Contribution, DriveId, PlacedBy},
-    correction::Correction,
+    correction::{Correction, CorrectionWalk},
     credibility::{DOUBTED, learned_doubts},
     crowding::first_crowd,
     georeferenced::UNBOUNDED_M,
@@ -128,8 +128,12 @@ pub fn fuse_from(
     params: &FleetParams,
     keep: Option<usize>,
 ) -> (FusedMap, Option<Beginning>) {
-    let prepared: Vec<PreparedDrive<'_>> =
-        drives.iter().map(|contribution| PreparedDrive::new(contribution, anchor, params)).collect();
+    let known = |drive: usize| beginning.and_then(|beginning| beginning.by_gnss(drive));
+    let prepared = drives.iter().enumerate().map(|(number, contribution)| match known(number) {
+        Some(by_gnss) => PreparedDrive::of(contribution, by_gnss.clone(), anchor, params),
+        None => PreparedDrive::new(contribution, anchor, params),
+    });
+    let prepared: Vec<PreparedDrive<'_>> = prepared.collect();
     let mut fusion = Fusion::new(base, &prepared, params);
     let laying = beginning.map_or_else(Laying::default, |beginning| fusion.go_on(beginning));
     let kept = fusion.place_all(laying, keep);
@@ -389,9 +393,10 @@ impl<'a> Fusion<'a> {
 
     /// Moves the lines with their witnesses, whose drives were corrected anew.
     fn settle_lines(&mut self) {
+        let mut walks: Vec<CorrectionWalk<'_>> = self.corrections.iter().map(CorrectionWalk::new).collect();
         for line in &mut self.lines.lines {
             for witness in line.knots.iter_mut().flat_map(|knot| &mut knot.witnesses) {
-                witness.shared = self.corrections[witness.drive].apply(&witness.map, witness.arc_m);
+                witness.shared = walks[witness.drive].place(&witness.map, witness.arc_m);
             }
             line.settle(self.params);
         }

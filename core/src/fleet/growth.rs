@@ -11,7 +11,7 @@ use std::{
 
 use super::{
     contribution::Contribution,
-    correction::Correction,
+    correction::{Correction, CorrectionWalk},
     joining::{Link, join, leaves_at_end},
     line::{FusedLaneId, Knot, Line, Lines, witness_at},
     matching::{Run, match_lanes},
@@ -89,6 +89,7 @@ impl Growing<'_> {
     fn testify(&self, lines: &mut Lines, correction: &Correction, lane_index: usize, run: &Run) {
         let lane = &self.pass.lanes[lane_index];
         let line = &mut lines.lines[run.line];
+        let mut walk = CorrectionWalk::new(correction);
         let first_sample = *run.samples.start();
         let (low, high) = run.ends();
         line.vote(&lane.lane.category_posterior, (high - low) * self.params.line_knot_m);
@@ -101,7 +102,7 @@ impl Growing<'_> {
                 let parameter = from.parameter + (to.parameter - from.parameter) * share;
                 line.testify(
                     knot,
-                    witness_at(self.witness(lane_index), lane, correction, first_sample + step, parameter),
+                    witness_at(self.witness(lane_index), lane, &mut walk, first_sample + step, parameter),
                 );
                 knot += 1;
             }
@@ -139,21 +140,27 @@ impl Growing<'_> {
         let at_tail = run.is_forward() == onward;
         let line = &mut lines.lines[run.line];
         let before = line.points.len();
+        let mut walk = CorrectionWalk::new(correction);
+        // It grows behind its last knot.
+        if !at_tail {
+            line.reverse();
+        }
         let rest_samples = rest.samples.clone();
         let order: Vec<usize> = if onward { rest_samples.collect() } else { rest_samples.rev().collect() };
         for sample in order {
             let near = &lane.samples[sample];
-            let place = correction.apply(&near.map, near.arc_m);
+            let place = walk.place(&near.map, near.arc_m);
             let last = line.points.len() - 1;
-            let (end, direction) =
-                if at_tail { (line.points[last], line.tangent(last)) } else { (line.points[0], -line.tangent(0)) };
-            let offset = place - end;
+            let direction = line.tangent(last);
+            let offset = place - line.points[last];
             if offset.norm() < 0.9 * self.params.line_knot_m || offset.dot(&direction) <= 0.0 {
                 continue;
             }
-            let witness = witness_at(self.witness(rest.lane), lane, correction, sample, near.parameter);
-            let knot = Knot { witnesses: vec![witness], ..Knot::default() };
-            if at_tail { line.push(place, knot) } else { line.push_front(place, knot) }
+            let witness = witness_at(self.witness(rest.lane), lane, &mut walk, sample, near.parameter);
+            line.push(place, Knot { witnesses: vec![witness], ..Knot::default() });
+        }
+        if !at_tail {
+            line.reverse();
         }
         let grown = line.points.len() - before;
         line.vote(&lane.lane.category_posterior, grown as f64 * self.params.line_knot_m);
@@ -165,12 +172,13 @@ impl Growing<'_> {
         let piece = pieces.entry((self.drive, lane.lane.id)).or_insert(0);
         let Contribution { started, drive, .. } = *self.contribution;
         let mut line = Line::new(FusedLaneId { started, drive, lane: lane.lane.id, piece: *piece, stretch: 0 });
+        let mut walk = CorrectionWalk::new(correction);
         for sample in rest.samples.clone() {
             let near = &lane.samples[sample];
-            let place = correction.apply(&near.map, near.arc_m);
+            let place = walk.place(&near.map, near.arc_m);
             let far = |last| nalgebra::distance(last, &place) >= 0.9 * self.params.line_knot_m;
             if line.points.last().is_none_or(far) {
-                let witness = witness_at(self.witness(rest.lane), lane, correction, sample, near.parameter);
+                let witness = witness_at(self.witness(rest.lane), lane, &mut walk, sample, near.parameter);
                 line.push(place, Knot { witnesses: vec![witness], ..Knot::default() });
             }
         }

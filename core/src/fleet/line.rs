@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     alignment::robust_weight,
     contribution::DriveId,
-    correction::Correction,
+    correction::CorrectionWalk,
     history::Belief,
     params::FleetParams,
     prepared::{PreparedLane, normal_of},
@@ -206,6 +206,12 @@ impl Line {
         self.knots.insert(0, knot);
     }
 
+    /// Turns it round.
+    pub(super) fn reverse(&mut self) {
+        self.points.reverse();
+        self.knots.reverse();
+    }
+
     /// The first drive that its first knot was seen by, as a number among the corrections.
     pub(super) fn first_drive(&self) -> usize {
         self.knots.iter().find_map(|knot| knot.witnesses.first()).map_or(0, |witness| witness.drive)
@@ -272,9 +278,10 @@ impl Line {
 
     /// Puts every knot to the mean of its witnesses, across the line and in height.
     pub(super) fn settle(&mut self, params: &FleetParams) {
+        let mut offsets = Offsets::default();
         let moved = (0..self.points.len()).map(|knot| {
             let normal = normal_of(&self.tangent(knot));
-            let mean = self.mean_offset(knot, &normal, params);
+            let mean = self.mean_of(knot, &normal, params, &mut offsets);
             self.points[knot] + Vector3::new(normal.x * mean.across_m, normal.y * mean.across_m, mean.height_m)
         });
         self.points = moved.collect();
@@ -282,18 +289,36 @@ impl Line {
 
     /// Where the witnesses of a knot put it, from where it is.
     pub(super) fn mean_offset(&self, knot: usize, normal: &Vector2<f64>, params: &FleetParams) -> MeanOffset {
+        self.mean_of(knot, normal, params, &mut Offsets::default())
+    }
+
+    fn mean_of(
+        &self,
+        knot: usize,
+        normal: &Vector2<f64>,
+        params: &FleetParams,
+        Offsets { across, height, sorted }: &mut Offsets,
+    ) -> MeanOffset {
         let place = self.points[knot];
-        let offsets = self.knots[knot].witnesses.iter().map(|witness| {
+        across.clear();
+        height.clear();
+        for witness in &self.knots[knot].witnesses {
             let offset = witness.shared - place;
-            (offset.xy().dot(normal), offset.z, witness)
-        });
-        let offsets: Vec<(f64, f64, &Witness)> = offsets.collect();
-        let across = offsets.iter().map(|(across, _, witness)| (*across, witness.share / witness.lateral_variance_m2));
-        let height = offsets.iter().map(|(_, height, witness)| (*height, witness.share / witness.height_variance_m2));
-        let (across_m, across_information) = robust_mean(&across.collect::<Vec<_>>(), params.robust_scale_m);
-        let (height_m, height_information) = robust_mean(&height.collect::<Vec<_>>(), 2.0 * params.robust_scale_m);
+            across.push((offset.xy().dot(normal), witness.share / witness.lateral_variance_m2));
+            height.push((offset.z, witness.share / witness.height_variance_m2));
+        }
+        let (across_m, across_information) = robust_mean(across, params.robust_scale_m, sorted);
+        let (height_m, height_information) = robust_mean(height, 2.0 * params.robust_scale_m, sorted);
         MeanOffset { across_m, height_m, across_information, height_information }
     }
+}
+
+/// Where the witnesses of a knot put it, with their weights: memory that is used for one knot after the other.
+#[derive(Debug, Default)]
+struct Offsets {
+    across: Vec<(f64, f64)>,
+    height: Vec<(f64, f64)>,
+    sorted: Vec<(f64, f64)>,
 }
 
 /// Mean of the witnesses of a knot.
@@ -308,9 +333,12 @@ pub(super) struct MeanOffset {
 }
 
 /// Mean of values with weights, from their weighted median by reweighting; and the sum of the weights that are left.
-fn robust_mean(values: &[(f64, f64)], scale_m: f64) -> (f64, f64) {
+fn robust_mean(values: &[(f64, f64)], scale_m: f64, sorted: &mut Vec<(f64, f64)>) -> (f64, f64) {
     const ROUNDS: usize = 4;
-    let mut mean = weighted_median(values);
+    sorted.clear();
+    sorted.extend_from_slice(values);
+    sorted.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let mut mean = weighted_median(sorted);
     let mut information = 0.0;
     for _ in 0..ROUNDS {
         let mut sum = 0.0;
@@ -328,9 +356,8 @@ fn robust_mean(values: &[(f64, f64)], scale_m: f64) -> (f64, f64) {
     (mean, information)
 }
 
-fn weighted_median(values: &[(f64, f64)]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+/// The median of values in their order.
+fn weighted_median(sorted: &[(f64, f64)]) -> f64 {
     let half = 0.5 * sorted.iter().map(|(_, weight)| weight).sum::<f64>();
     let mut below = 0.0;
     for (index, (value, weight)) in sorted.iter().enumerate() {
@@ -421,7 +448,7 @@ impl Lines {
 pub(super) fn witness_at(
     (drive, pass, lane_index): (usize, usize, usize),
     lane: &PreparedLane<'_>,
-    correction: &Correction,
+    walk: &mut CorrectionWalk<'_>,
     sample: usize,
     parameter: f64,
 ) -> Witness {
@@ -435,7 +462,7 @@ pub(super) fn witness_at(
         lane: lane_index,
         map,
         arc_m: near.arc_m,
-        shared: correction.apply(&map, near.arc_m),
+        shared: walk.place(&map, near.arc_m),
         lateral_variance_m2: near.lateral_variance_m2,
         height_variance_m2: near.height_variance_m2,
         share: (to_end_m / TAPER_M).clamp(0.05, 1.0),

@@ -11,7 +11,7 @@ use nalgebra::{Point3, Vector2, Vector3};
 
 use super::{
     correction::{Correction, CorrectionWalk},
-    line::Lines,
+    line::{Line, Lines},
     params::FleetParams,
     prepared::{PreparedLane, count_of, normal_of},
 };
@@ -95,9 +95,11 @@ pub(super) fn match_lane(
         for (sample, (own, (place, direction))) in samples.enumerate() {
             let variance = own.lateral_variance_m2 + ALIGNMENT_SIGMA_M.powi(2);
             for beside in &lines_near {
-                let Some(foot) = foot_on(lines, beside.line, beside.guess(sample, end - start), place) else {
+                let guess = beside.guess(sample, end - start);
+                if is_surely_beyond(&lines.lines[beside.line], guess, place, params.gate_m) {
                     continue;
-                };
+                }
+                let Some(foot) = foot_on(lines, beside.line, guess, place) else { continue };
                 let heading = direction.xy();
                 let parallel = heading.dot(&foot.tangent).abs() >= LEAST_COSINE * heading.norm() * foot.tangent.norm();
                 let within = foot.across_m.abs() <= params.gate_m && foot.height_m.abs() <= params.gate_height_m;
@@ -228,6 +230,20 @@ pub(super) struct Foot {
     pub(super) height_m: f64,
     /// Along the line, horizontally.
     pub(super) tangent: Vector2<f64>,
+}
+
+/// Whether a place lies farther across from a line than `gate_m`, told without a foot point: beside the knot about which it is
+/// guessed to lie, with room for a bend of 10 m of radius.
+fn is_surely_beyond(line: &Line, guess: f64, place: &Point3<f64>, gate_m: f64) -> bool {
+    const ALONG_M: f64 = 4.5;
+    const BEND_M: f64 = 1.1;
+    let last = line.points.len() - 1;
+    let knot = count_of(guess + 0.5).min(last);
+    let chord = (line.points[(knot + 1).min(last)] - line.points[knot.saturating_sub(1)]).xy();
+    let offset = (place - line.points[knot]).xy();
+    let (chord_m2, across_m) = (chord.norm_squared(), gate_m + BEND_M);
+    let (along, across) = (offset.dot(&chord), chord.perp(&offset));
+    along * along <= ALONG_M * ALONG_M * chord_m2 && across * across > across_m * across_m * chord_m2
 }
 
 /// Foot point of a place on a line, looked for from a parameter on.

@@ -121,9 +121,28 @@ const NEAR_M: f64 = 30.0;
 
 impl<'a> PreparedDrive<'a> {
     pub(super) fn new(contribution: &'a Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
-        let trajectory = &contribution.trajectory;
         let restraints = Restraints::new(contribution, anchor, params);
-        let by_gnss = by_gnss(trajectory, &restraints, params);
+        let by_gnss = by_gnss(&contribution.trajectory, &restraints, params);
+        Self::placed(contribution, restraints, by_gnss, params)
+    }
+
+    /// The same, where it is known already where GNSS and odometry alone put it.
+    pub(super) fn of(
+        contribution: &'a Contribution,
+        by_gnss: Option<Correction>,
+        anchor: &Anchor,
+        params: &FleetParams,
+    ) -> Self {
+        Self::placed(contribution, Restraints::new(contribution, anchor, params), by_gnss, params)
+    }
+
+    fn placed(
+        contribution: &'a Contribution,
+        restraints: Restraints,
+        by_gnss: Option<Correction>,
+        params: &FleetParams,
+    ) -> Self {
+        let trajectory = &contribution.trajectory;
         let passes = passes(&way(trajectory, by_gnss.as_ref()));
         let passes: Vec<&[TrajectoryPoint]> = passes.into_iter().map(|range| &trajectory[range]).collect();
         let mut prepared: Vec<PreparedPass<'_>> =

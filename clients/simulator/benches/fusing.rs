@@ -1,4 +1,4 @@
-//! What it costs to fuse a cell: all of its drives anew, and the younger ones onto what is left of the older.
+//! What it costs to fuse a cell: all of its drives anew, and again after one of them, which is live, has grown.
 //!
 //! `cargo bench -p lanemap-simulator --bench fusing`
 
@@ -10,7 +10,7 @@ use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use lanemap_core::{
     Mapper, Params, Preset,
     fleet::{
-        Base, CellId, Contribution, DriveId, FleetParams, Trace, by_seniority, cell::cut, fold, fuse, fuse_onto,
+        Base, CellId, Contribution, DriveId, FleetParams, Trace, by_seniority, cell::cut, fold, fuse, fuse_from,
         split_to_fold,
     },
     geometry::{Pose, georeference::Georeference},
@@ -19,8 +19,6 @@ use lanemap_simulator::{
     Seed,
     fleet::{Fleet, FleetDrive, FleetScenario},
 };
-
-const DRIVES: [u32; 2] = [10, 50];
 
 /// What a drive says of its cells.
 fn contributions(drive: &FleetDrive<'_>, fleet: &Fleet) -> Vec<(CellId, Contribution)> {
@@ -35,9 +33,9 @@ fn contributions(drive: &FleetDrive<'_>, fleet: &Fleet) -> Vec<(CellId, Contribu
     cut(&whole.expect("it has frames"), &Georeference { anchor: fleet.georeference().anchor, enu_from_map })
 }
 
-/// The cell of a winding road of 1 km in which most of it lies, with so many drives.
-fn cell(drives: u32) -> (CellId, Vec<Contribution>) {
-    let fleet = FleetScenario { drives, ..FleetScenario::winding_road() }.fleet(Seed(1));
+/// The cell in which most of a fleet's way lies.
+fn fullest_cell(scenario: &FleetScenario) -> (CellId, Vec<Contribution>) {
+    let fleet = scenario.fleet(Seed(1));
     let all: Vec<(CellId, Contribution)> = fleet.drives().flat_map(|drive| contributions(&drive, &fleet)).collect();
     let points_in =
         |cell: CellId| all.iter().filter(|(of, _)| *of == cell).map(|(_, drive)| drive.trajectory.len()).sum::<usize>();
@@ -45,24 +43,36 @@ fn cell(drives: u32) -> (CellId, Vec<Contribution>) {
     (fullest, all.into_iter().filter(|(cell, _)| *cell == fullest).map(|(_, drive)| drive).collect())
 }
 
+/// A road of 1 km, and a town, with so many drives.
+fn scenarios() -> [(&'static str, FleetScenario); 3] {
+    let road = |drives| FleetScenario { drives, ..FleetScenario::winding_road() };
+    [
+        ("road_10", road(10)),
+        ("road_50", road(50)),
+        ("town_120", FleetScenario { drives: 120, ..FleetScenario::small_town(40) }),
+    ]
+}
+
 fn fusing(criterion: &mut Criterion) {
     let params = FleetParams::default();
     let mut group = criterion.benchmark_group("fuse");
     group.sample_size(10);
-    for drives in DRIVES {
-        let (cell, contributions) = cell(drives);
+    for (name, scenario) in scenarios() {
+        let (cell, contributions) = fullest_cell(&scenario);
         let anchor = cell.anchor();
-        group.bench_function(BenchmarkId::new("a_cell_anew", drives), |bencher| {
+        group.bench_function(BenchmarkId::new("anew", name), |bencher| {
             bencher.iter(|| fuse(black_box(&contributions), &anchor, &params));
         });
+        // As the service has it: the oldest folded, and all but the youngest, which grows, laid already.
         let ordered = by_seniority(&contributions);
         let (mut base, mut rest) = (Base::default(), ordered.as_slice());
         while let Some((oldest, younger)) = split_to_fold(rest, &anchor, &params) {
             base = fold(&base, oldest, &anchor, &params);
             rest = younger;
         }
-        group.bench_function(BenchmarkId::new("a_cell_onto_its_base", drives), |bencher| {
-            bencher.iter(|| fuse_onto(black_box(&base), rest, &anchor, &params));
+        let (_, beginning) = fuse_from(None, &base, rest, &anchor, &params, Some(rest.len() - 1));
+        group.bench_function(BenchmarkId::new("one_drive_grown", name), |bencher| {
+            bencher.iter(|| fuse_from(beginning.as_ref(), black_box(&base), rest, &anchor, &params, None));
         });
     }
     group.finish();

@@ -36,6 +36,8 @@ pub struct MapLane {
     pub category: Category,
     /// Probability of each category, in the order of [`Category::ALL`]; sums to 1.
     pub category_posterior: Vec<f64>,
+    /// Where it changes its category: its stretches in their order; empty where it is the same all along.
+    pub category_stretches: Vec<CategoryStretch>,
     /// Control points in the direction of travel, about 3 m apart; at least 2.
     pub control_points: Vec<ControlPoint>,
     /// How the curve ends.
@@ -52,6 +54,38 @@ pub struct MapLane {
     pub first_seen: TimestampNs,
     /// Time of the last frame that saw it.
     pub last_seen: TimestampNs,
+}
+
+/// A stretch of a lane that is painted alike.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CategoryStretch {
+    /// Where it ends, as spline parameter; it begins where the one before ends.
+    pub to: f64,
+    /// Probability of each category, in the order of [`Category::ALL`]; sums to 1.
+    pub posterior: Vec<f64>,
+}
+
+impl MapLane {
+    /// Probability of each category at a spline parameter, in the order of [`Category::ALL`].
+    #[must_use]
+    pub fn category_posterior_at(&self, parameter: f64) -> &[f64] {
+        let stretch = self.category_stretches.iter().find(|stretch| parameter <= stretch.to);
+        stretch.or(self.category_stretches.last()).map_or(&self.category_posterior, |stretch| &stretch.posterior)
+    }
+
+    /// Its stretches as a lane has them that is this one from one parameter to another.
+    #[must_use]
+    pub fn category_stretches_between(&self, from: f64, to: f64) -> Vec<CategoryStretch> {
+        let Some(first) = self.category_stretches.iter().position(|stretch| stretch.to > from) else {
+            return self.category_stretches.last().cloned().into_iter().collect();
+        };
+        let within = self.category_stretches[first..].iter();
+        let last = within.clone().position(|stretch| stretch.to >= to).unwrap_or(usize::MAX);
+        within
+            .take(last.saturating_add(1))
+            .map(|stretch| CategoryStretch { to: stretch.to - from, posterior: stretch.posterior.clone() })
+            .collect()
+    }
 }
 
 /// All lanes of a drive, in the order of their ids.

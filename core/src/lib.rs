@@ -62,7 +62,7 @@ pub use category::Category;
 pub use error::{FrameError, PoseError, SnapshotError};
 pub use frame::{Detection, Frame, FrameLimits, FrameParts, GnssFix, Occlusion, Odometry, Sequence, TimestampNs};
 pub use geometry::{Pose, TangentCovariance};
-pub use lane_map::{ControlPoint, EndRule, LaneId, LaneMap, LocalLane, LocalWindow, MapLane};
+pub use lane_map::{CategoryStretch, ControlPoint, EndRule, LaneId, LaneMap, LocalLane, LocalWindow, MapLane};
 pub use mapper::{Mapper, StepReport};
 pub use params::{Params, Preset};
 pub use sensor::{FieldOfView, Sensor};

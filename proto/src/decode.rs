@@ -200,6 +200,7 @@ fn lane(message: &v1::Lane, index: usize) -> Result<MapLane, DecodeError> {
         id: LaneId(message.id),
         category: category(message.category, || format!("lanes[{index}].category"))?,
         category_posterior: message.category_posterior.clone(),
+        category_stretches: Vec::new(),
         control_points: controls
             .map(|(k, message)| control_point(message, || format!("lanes[{index}].control_points[{k}]")))
             .collect::<Result<_, _>>()?,

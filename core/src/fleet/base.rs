@@ -67,6 +67,7 @@ impl Base {
                     drive,
                     pass: BASE,
                     lane: 0,
+                    parameter: 0.0,
                     map: knot.place,
                     arc_m: 0.0,
                     shared,

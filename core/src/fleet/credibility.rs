@@ -87,6 +87,7 @@ mod tests {
                 drive,
                 pass: drive,
                 lane: 0,
+                parameter: knot as f64,
                 map: place,
                 arc_m: place.x,
                 shared: place + side * offset_m * nalgebra::Vector3::y(),

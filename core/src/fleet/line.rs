@@ -91,6 +91,8 @@ pub(super) struct Witness {
     pub(super) pass: usize,
     /// The lane, as a number among those of the pass.
     pub(super) lane: usize,
+    /// Spline parameter of the lane there.
+    pub(super) parameter: f64,
     /// Map frame of the drive.
     pub(super) map: Point3<f64>,
     pub(super) arc_m: f64,
@@ -460,6 +462,7 @@ pub(super) fn witness_at(
         drive,
         pass,
         lane: lane_index,
+        parameter,
         map,
         arc_m: near.arc_m,
         shared: walk.place(&map, near.arc_m),

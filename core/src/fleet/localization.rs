@@ -44,6 +44,7 @@
 //! let own = |point: &Point3<f64>| Point3::new(-point.y, point.x, 0.0);
 //! let lane = |(number, left_m): (usize, f64)| MapLane {
 //!     id: LaneId(number as u64), category: Category::WhiteSolid, category_posterior: vec![1.0 / 15.0; 15],
+//!     category_stretches: vec![],
 //!     control_points: road(left_m).iter()
 //!         .map(|point| ControlPoint { position: own(point), covariance: Matrix3::identity() * 0.01 }).collect(),
 //!     ends: EndRule::Reflected, drawn_from: 0.0, drawn_to: 189.0, existence: 0.9, observations: 40,

@@ -85,7 +85,8 @@ impl Fusion<'_> {
                 let mut names: Vec<Naming> = apart
                     .filter_map(|witness| {
                         let pass = passes.get(witness.pass).copied().flatten()?;
-                        Naming::new(witness.pass, &pass.lanes[witness.lane].lane.category_posterior)
+                        let lane = pass.lanes[witness.lane].lane;
+                        Naming::new(witness.pass, lane.category_posterior_at(witness.parameter))
                     })
                     .collect();
                 names.sort_unstable_by_key(|naming| naming.pass);

@@ -12,7 +12,7 @@ use nalgebra::{Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    category::CategoryBelief,
+    category::{CategoryAlong, CategoryBelief},
     existence::Existence,
     extent::{Extent, Sighting},
     foot_walk::FootWalk,
@@ -39,6 +39,8 @@ pub struct Landmark {
     pub id: LaneId,
     /// What it is painted as.
     pub category: CategoryBelief,
+    /// The same at each of its knots.
+    pub category_along: CategoryAlong,
     /// Whether it exists.
     pub existence: Existence,
     /// Where it begins and ends.
@@ -136,6 +138,7 @@ impl Landmark {
         let mut lane = Self {
             id,
             category: CategoryBelief::default(),
+            category_along: CategoryAlong::default(),
             existence: Existence::at_birth(),
             extent: Extent::default(),
             observations: 0,
@@ -352,7 +355,7 @@ impl Landmark {
         samples.iter().filter_map(place).collect()
     }
 
-    /// Counts this frame's votes on where the line begins and ends.
+    /// Counts this frame's votes on where the line begins and ends, and on what it is painted as there.
     pub fn vote_extent(
         &mut self,
         observation: &LaneObservation,
@@ -383,6 +386,9 @@ impl Landmark {
             extent.vote(&sighting, (from, to), |parameter| walk.point(parameter - head), visibility, variance);
         }
         self.extent = extent;
+        let (first, last) = sighting.certain;
+        #[allow(clippy::cast_possible_truncation)] // knots of a lane, far below 2^53
+        self.category_along.vote(observation.category, first.ceil() as Knot, last.floor() as Knot);
     }
 
     /// Counts the frames that missed the lane since it was seen last against what they had in view: it was drawn too far.
@@ -461,6 +467,7 @@ impl Landmark {
         self.first_seen = self.first_seen.min(other.first_seen);
         self.last_seen = self.last_seen.max(other.last_seen);
         let mut extent = std::mem::take(&mut self.extent);
+        let mut category_along = std::mem::take(&mut self.category_along);
         if let (Some(mine), Some(theirs)) = (self.curve(params.ends), other.curve(params.ends)) {
             let near = self.knots();
             let (head, their_head) = (near.0 as f64, other.information.head() as f64);
@@ -469,8 +476,11 @@ impl Landmark {
                 head + walk.nearest_parameter(&theirs.point(parameter - their_head))
             };
             extent.absorb(&other.extent, to_mine);
+            #[allow(clippy::cast_possible_truncation)] // knots of a lane, far below 2^53
+            category_along.absorb(&other.category_along, |knot| to_mine(knot as f64).round() as Knot);
         }
         self.extent = extent;
+        self.category_along = category_along;
     }
 }
 

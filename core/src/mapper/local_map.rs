@@ -49,6 +49,7 @@ pub(super) fn map_lane(lane: &Landmark, params: &Params) -> Option<MapLane> {
         id: lane.id,
         category: lane.category.best(),
         category_posterior: lane.category.posterior(params.association.category_confusion).to_vec(),
+        category_stretches: lane.category_along.stretches(lane.knots().0, params.association.category_confusion),
         control_points,
         ends: params.landmark.ends,
         drawn_from,

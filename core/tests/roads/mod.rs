@@ -176,6 +176,7 @@ impl<'a> Survey<'a> {
                 id: LaneId(index as u64 + 1),
                 category: *category,
                 category_posterior,
+                category_stretches: vec![],
                 ends: EndRule::Reflected,
                 drawn_from: 0.0,
                 drawn_to: (control_points.len() - 1) as f64,

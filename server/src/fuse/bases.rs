@@ -130,6 +130,7 @@ pub(super) mod tests {
             id: LaneId(1),
             category: Category::WhiteSolid,
             category_posterior: vec![1.0 / 15.0; 15],
+            category_stretches: vec![],
             control_points: points.collect(),
             ends: EndRule::Reflected,
             drawn_from: 0.0,

@@ -12,7 +12,7 @@ const ALGORITHM: u32 = 13;
 
 /// Raise it where the bytes of contributions or of fused cells change: what an earlier build wrote is then written anew from
 /// the drives' snapshots.
-pub(super) const FORMAT: u16 = 3;
+pub(super) const FORMAT: u16 = 4;
 
 /// Version of a cell: grows by one with every change of its map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

@@ -11,7 +11,8 @@
 //!     .map(|i| ControlPoint { position: Point3::new(3.0 * f64::from(i), 0.0, 0.0), covariance: Matrix3::zeros() })
 //!     .collect();
 //! let lane = MapLane {
-//!     id: LaneId(1), category: Category::WhiteSolid, category_posterior: vec![], control_points,
+//!     id: LaneId(1), category: Category::WhiteSolid, category_posterior: vec![],
+//!     category_stretches: vec![], control_points,
 //!     ends: EndRule::Reflected, drawn_from: 0.0, drawn_to: 2.5, existence: 1.0, observations: 9,
 //!     first_seen: TimestampNs(0), last_seen: TimestampNs(0),
 //! };

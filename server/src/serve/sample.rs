@@ -30,6 +30,7 @@ pub fn lane_of(id: u64, points: Vec<Point3<f64>>) -> MapLane {
         id: LaneId(id),
         category: Category::WhiteDashed,
         category_posterior: vec![1.0 / 15.0; 15],
+        category_stretches: vec![],
         control_points: points
             .into_iter()
             .map(|position| ControlPoint { position, covariance: Matrix3::identity() * 0.01 })

@@ -119,6 +119,7 @@ fn stretches_within(lane: &MapLane, along: &[Vec<Nearby>], cell: CellId) -> Vec<
             stretches.push(MapLane {
                 id: LaneId(lane.id.0 + ((stretches.len() as u64) << LANE_BITS)),
                 category_posterior: lane.category_posterior.clone(),
+                category_stretches: lane.category_stretches_between(points.start as f64, (points.end - 1) as f64),
                 control_points: lane.control_points[points].to_vec(),
                 drawn_from,
                 drawn_to,
@@ -168,6 +169,7 @@ mod tests {
             id: LaneId(7),
             category: Category::WhiteSolid,
             category_posterior: vec![],
+            category_stretches: vec![],
             control_points: control_points.collect(),
             ends: EndRule::Reflected,
             drawn_from: 0.5,

@@ -112,6 +112,7 @@ fn kept_lanes(lanes: &[MapLane], prepared: &[&PreparedLane<'_>], kept_m: &RangeI
         let last = count_of(to.ceil()).min(lane.control_points.len().checked_sub(1)?);
         (from < to && first < last).then(|| MapLane {
             control_points: lane.control_points[first..=last].to_vec(),
+            category_stretches: lane.category_stretches_between(first as f64, last as f64),
             drawn_from: (lane.drawn_from - first as f64).max(from - first as f64),
             drawn_to: (lane.drawn_to - first as f64).min(to - first as f64),
             ..lane.clone()

@@ -146,6 +146,7 @@ fn drive(road: &Road, seen: Seen) -> Contribution {
             id: LaneId(number as u64 + 1),
             category: *category,
             category_posterior: posterior(*category),
+            category_stretches: vec![],
             drawn_from: 0.0,
             drawn_to: (control_points.len() - 1) as f64,
             control_points,

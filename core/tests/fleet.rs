@@ -212,6 +212,39 @@ fn a_drive_far_off_or_warped_does_not_spoil_the_map_of_the_others() {
     assert!(p95(&map) <= 1.2 * p95(&clean).max(0.05), "{} {}", p95(&map), p95(&clean));
 }
 
+/// The drives, the first few of them by receivers that are so many degrees off, north and east.
+fn first_aside(drives: &[Contribution], count: usize, [north_deg, east_deg]: [f64; 2]) -> FusedMap {
+    let mut drives = drives.to_vec();
+    let fixes =
+        drives[..count].iter_mut().flat_map(|drive| &mut drive.trajectory).filter_map(|point| point.fix.as_mut());
+    for fix in fixes {
+        fix.latitude_deg += north_deg;
+        fix.longitude_deg += east_deg;
+    }
+    fused(&drives)
+}
+
+fn drives_apart(map: &FusedMap) -> Vec<usize> {
+    let drives = map.drives.iter().enumerate().filter(|(_, drive)| drive.correction.is_none());
+    drives.map(|(index, _)| index).collect()
+}
+
+#[test]
+fn two_drives_that_are_wrong_alike_make_no_second_road_beside_a_known_one_and_three_do() {
+    let drives = Survey::of(&Road::bend(400.0), 11).drives(12);
+    // 45 m across the middle of the road: nowhere do the two roads meet.
+    let aside = |count: usize| drives_apart(&first_aside(&drives, count, [3.6e-4, -2.8e-4]));
+    assert_eq!([aside(0), aside(1), aside(2), aside(3)], [vec![], vec![0], vec![0, 1], vec![]]);
+}
+
+#[test]
+fn a_first_drive_whose_wrong_road_crosses_the_true_one_keeps_nobody_else_apart() {
+    let drives = Survey::of(&Road::bend(400.0), 11).drives(12);
+    // 45 m to the north-east: the wrong road runs over the end of the true one.
+    let aside = |count: usize| drives_apart(&first_aside(&drives, count, [3e-4, 4e-4]));
+    assert_eq!([aside(1), aside(3)], [vec![0], vec![0, 1, 2]]);
+}
+
 /// A drive whose camera is turned, or that saw badly: its lanes wave from side to side.
 fn waving(mut drive: Contribution, amplitude_m: f64, start: f64) -> Contribution {
     for point in drive.lanes.iter_mut().flat_map(|lane| &mut lane.control_points) {

@@ -254,10 +254,38 @@ impl<'a> Fusion<'a> {
             laying.passes += self.drives[drive].passes.len();
             laying.drives += 1;
         }
+        if self.are_outvoted(&laying) {
+            self.begin_with_refused(&mut laying);
+        }
         for (drive, first_pass) in laying.later {
             self.placed[drive] = self.place_drive(drive, first_pass, &mut laying.pieces, true);
         }
         kept
+    }
+
+    /// Whether more drives fit nowhere than were laid: then those lie wrong, though they came first.
+    fn are_outvoted(&self, laying: &Laying) -> bool {
+        let laid = self.is_laid.iter().filter(|is_laid| **is_laid).count();
+        laying.later.len() > laid + self.base.drives()
+    }
+
+    /// Begins anew with the drives that fitted nowhere; those that were laid are to fit what comes of them.
+    fn begin_with_refused(&mut self, laying: &mut Laying) {
+        let first_passes = self.drives.iter().scan(0, |next, drive| {
+            let first = *next;
+            *next += drive.passes.len();
+            Some(first)
+        });
+        let laid = first_passes.enumerate().filter(|(drive, _)| self.is_laid[*drive]).collect::<Vec<_>>();
+        let refused = std::mem::take(&mut laying.later);
+        *self = Self::new(self.base, self.drives, self.params);
+        laying.pieces = Pieces::new();
+        for (drive, first_pass) in refused {
+            if !self.place_drive(drive, first_pass, &mut laying.pieces, false) {
+                laying.later.push((drive, first_pass));
+            }
+        }
+        laying.later.extend(laid);
     }
 
     /// Lays one drive on the lines and adds it to them; whether it was found.
@@ -426,20 +454,26 @@ impl<'a> Fusion<'a> {
 
     /// Takes out drives that went where others did, by what their receivers say, and share no line with them; whether any.
     ///
-    /// A drive on a road of its own shares none either, but others are not near its way.
+    /// A drive on a road of its own shares none either, but others are not near its way. Beside a road that is well known, two that
+    /// share their lines with each other alone are not yet believed either: they may be wrong alike.
     fn keep_apart_strangers(&mut self) -> bool {
-        let mut shared = vec![(0_usize, 0_usize); self.drives.len()];
+        const MANY: u32 = 6;
+        let mut shared = vec![(0_usize, 0_usize, 0_usize); self.drives.len()];
         for knot in self.lines.lines.iter().flat_map(|line| &line.knots) {
-            let several = knot.drives() > 1;
+            let (several, more) = (knot.drives() > 1, knot.drives() > 2);
             for witness in knot.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
-                let (with_others, all) = &mut shared[witness.drive];
+                let (with_others, with_more, all) = &mut shared[witness.drive];
                 *with_others += usize::from(several);
+                *with_more += usize::from(more);
                 *all += 1;
             }
         }
-        let strangers = shared.iter().enumerate().filter(|(drive, (with_others, all))| {
-            let alone = (*with_others as f64) < self.params.least_shared * *all as f64;
-            self.placed[*drive] && alone && self.goes_where_others_do(*drive)
+        let strangers = shared.iter().enumerate().filter(|(drive, (with_others, with_more, all))| {
+            let is_alone = (*with_others as f64) < self.params.least_shared * *all as f64;
+            let has_few = (*with_more as f64) < self.params.least_shared * *all as f64;
+            self.placed[*drive]
+                && (is_alone && self.goes_where_others_do(*drive, 2)
+                    || has_few && self.goes_where_others_do(*drive, MANY))
         });
         let strangers: Vec<usize> = strangers.map(|(drive, _)| drive).collect();
         for drive in &strangers {
@@ -448,14 +482,14 @@ impl<'a> Fusion<'a> {
         !strangers.is_empty()
     }
 
-    /// Whether most of a drive's way lies near lines of others, more than one of them.
-    fn goes_where_others_do(&self, drive: usize) -> bool {
+    /// Whether most of a drive's way lies near lines that at least so many drives saw.
+    fn goes_where_others_do(&self, drive: usize, least_drives: u32) -> bool {
         const STRIDE: usize = 5;
         let way: Vec<_> = self.drives[drive].contribution.trajectory.iter().step_by(STRIDE).collect();
         let near_others = way.iter().filter(|point| {
             let place = self.corrections[drive].apply(&point.position, point.arc_m);
             let near = self.lines.near(&place, self.params.strangers_within_m);
-            near.into_iter().any(|(line, knot)| self.lines.lines[line].knots[knot].drives() > 1)
+            near.into_iter().any(|(line, knot)| self.lines.lines[line].knots[knot].drives() >= least_drives)
         });
         2 * near_others.count() > way.len()
     }

@@ -10,7 +10,7 @@ pub use frame::frame;
 pub use sensor::{PointFrame, sensor};
 
 use lanemap_core::{
-    Category, ControlPoint, EndRule, FrameError, LaneId, LaneMap, LocalLane, MapLane, TimestampNs,
+    Category, CategoryStretch, ControlPoint, EndRule, FrameError, LaneId, LaneMap, LocalLane, MapLane, TimestampNs,
     geometry::{Pose, TangentCovariance},
 };
 use nalgebra::{Matrix3, Point3, Quaternion, Translation3, UnitQuaternion};
@@ -200,7 +200,7 @@ fn lane(message: &v1::Lane, index: usize) -> Result<MapLane, DecodeError> {
         id: LaneId(message.id),
         category: category(message.category, || format!("lanes[{index}].category"))?,
         category_posterior: message.category_posterior.clone(),
-        category_stretches: Vec::new(),
+        category_stretches: message.category_stretches.iter().map(category_stretch).collect(),
         control_points: controls
             .map(|(k, message)| control_point(message, || format!("lanes[{index}].control_points[{k}]")))
             .collect::<Result<_, _>>()?,
@@ -212,6 +212,10 @@ fn lane(message: &v1::Lane, index: usize) -> Result<MapLane, DecodeError> {
         first_seen: TimestampNs(message.first_seen_unix_ns),
         last_seen: TimestampNs(message.last_seen_unix_ns),
     })
+}
+
+fn category_stretch(message: &v1::CategoryStretch) -> CategoryStretch {
+    CategoryStretch { to: message.to, posterior: message.posterior.clone() }
 }
 
 fn control_point(message: &v1::ControlPoint, field: impl Fn() -> String) -> Result<ControlPoint, DecodeError> {

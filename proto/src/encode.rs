@@ -1,8 +1,8 @@
 //! From the types of `lanemap-core` to the wire. Nothing is rounded: [`decode`](crate::decode) gives the same bits back.
 
 use lanemap_core::{
-    Category, ControlPoint, Detection, EndRule, FieldOfView, Frame, GnssFix, LocalLane, MapLane, Occlusion, Odometry,
-    Preset, Sensor,
+    Category, CategoryStretch, ControlPoint, Detection, EndRule, FieldOfView, Frame, GnssFix, LocalLane, MapLane,
+    Occlusion, Odometry, Preset, Sensor,
     geometry::{Pose, TangentCovariance, georeference::Georeference},
 };
 use nalgebra::Point3;
@@ -98,7 +98,12 @@ pub fn lane(lane: &MapLane) -> v1::Lane {
         observations: lane.observations,
         first_seen_unix_ns: lane.first_seen.0,
         last_seen_unix_ns: lane.last_seen.0,
+        category_stretches: lane.category_stretches.iter().map(category_stretch).collect(),
     }
+}
+
+fn category_stretch(stretch: &CategoryStretch) -> v1::CategoryStretch {
+    v1::CategoryStretch { to: stretch.to, posterior: stretch.posterior.clone() }
 }
 
 fn control_point(control: &ControlPoint) -> v1::ControlPoint {

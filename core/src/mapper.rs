@@ -35,7 +35,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 7;
+const SNAPSHOT_VERSION: u16 = 8;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]

@@ -1,5 +1,6 @@
 //! Where the vehicle is: prediction by odometry, correction by the lanes of the map.
 
+pub mod motion;
 pub mod pose_update;
 pub mod prediction;
 

@@ -103,7 +103,7 @@ pub async fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let started = Instant::now();
     let mut reports = Vec::new();
     for drive in &mut drives {
-        reports.push(replay_drive(args, drive, server.as_ref(), record.as_ref(), &progress).await?);
+        reports.push(Box::pin(replay_drive(args, drive, server.as_ref(), record.as_ref(), &progress)).await?);
     }
     progress.finish();
     let report = ReplayReport::new(reports, started.elapsed());

@@ -12,7 +12,7 @@
 
 use nalgebra::{Matrix2, Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
-use super::PoseEstimate;
+use super::{PoseEstimate, motion::Twist};
 use crate::{
     geometry::{
         Pose, TangentCovariance,
@@ -49,7 +49,7 @@ const BEND_RANGE_M: f64 = 50.0;
 /// Corrects a predicted pose by the lanes matched in one frame, starting the search at `start`.
 ///
 /// The lanes show the sum `s = x + c` of the pose and the detector's error (`prediction`); what is found of `s` is shared out by
-/// their covariances: with `G = P [I I]^T M^-1`, `M = [I I] P [I I]^T`, both move by `G (s - s_predicted)`.
+/// their covariances: with `G = P [I I]^T M^-1`, `M = [I I] P [I I]^T`, both move by `G (s - s_predicted)`, and so does the twist.
 #[must_use]
 pub fn update_pose(
     predicted: &PoseEstimate,
@@ -129,11 +129,13 @@ const LEVER_M: f64 = 10.0;
 /// Directions of less information than this, 1/m^2, are not constrained by lanes at all.
 const LEAST_INFORMATION: f64 = 1.0;
 
-/// Shares a found sum out to the pose and the detector's error.
+/// Shares a found sum out to the pose, the detector's error and the twist.
 fn share_out(predicted: &PoseEstimate, prior: &Prior, found: &Pose, found_covariance: &Matrix6<f64>) -> PoseEstimate {
     let PoseEstimate { covariance, detector_covariance, cross_covariance: cross, .. } = predicted;
     let pose_gain = (covariance + cross) * prior.information;
     let error_gain = (detector_covariance + cross.transpose()) * prior.information;
+    let Twist { with_pose, with_error, .. } = &predicted.twist;
+    let twist_gain = (with_pose + with_error).transpose() * prior.information;
     let innovation = log(&(prior.predicted_from_map * found));
     let gone = prior.covariance - found_covariance;
     let symmetric = |matrix: Matrix6<f64>| (matrix + matrix.transpose()) * 0.5;
@@ -144,6 +146,12 @@ fn share_out(predicted: &PoseEstimate, prior: &Prior, found: &Pose, found_covari
         detector_covariance: symmetric(detector_covariance - error_gain * gone * error_gain.transpose()),
         cross_covariance: cross - pose_gain * gone * error_gain.transpose(),
         remembered: predicted.remembered,
+        twist: Twist {
+            per_second: predicted.twist.per_second + twist_gain * innovation,
+            covariance: symmetric(predicted.twist.covariance - twist_gain * gone * twist_gain.transpose()),
+            with_pose: with_pose - pose_gain * gone * twist_gain.transpose(),
+            with_error: with_error - error_gain * gone * twist_gain.transpose(),
+        },
     }
 }
 

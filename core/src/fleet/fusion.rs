@@ -8,30 +8,33 @@
 //! still be shifted as a whole. Which drives are folded depends on their order of seniority alone, so that the
 //! map is the same function of the set of contributions.
 
+mod kept_apart;
+mod laying;
+
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use super::{
-    alignment::{Eliminations, RobustScales, Sighting, Target, align, align_one},
+    alignment::{Eliminations, RobustScales, Sighting, Target, align},
     base::Base,
     beginning::Beginning,
-    bridging::{Parts, Placement},
+    bridging::Parts,
     change::MapChange,
     continuity::run_on,
     contribution::{Contribution, DriveId, PlacedBy},
     correction::{Correction, CorrectionWalk},
     credibility::{DOUBTED, learned_doubts},
     crowding::first_crowd,
-    georeferenced::UNBOUNDED_M,
     growth::{Growing, Pieces},
     line::{FusedLane, Lines},
-    matching::match_lanes,
     params::FleetParams,
-    prepared::{COARSE_STRIDE, PreparedDrive, PreparedPass, Restraints, normal_of},
+    prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
     receivers::learned_shape_share,
     ways::Ways,
 };
+pub(super) use laying::Laying;
+
 use crate::geometry::georeference::Anchor;
 
 /// How a drive lies in the map.
@@ -141,17 +144,6 @@ pub fn fuse_from(
     (fusion.into_map(base), kept)
 }
 
-/// How far the laying of drives has come.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Laying {
-    /// How many have been laid, and how many passes they have.
-    pub(super) drives: usize,
-    passes: usize,
-    pieces: Pieces,
-    /// Drives that fit nowhere as yet, with their first passes.
-    later: Vec<(usize, usize)>,
-}
-
 /// Drives while they are fused.
 pub(super) struct Fusion<'a> {
     pub(super) drives: &'a [PreparedDrive<'a>],
@@ -240,124 +232,11 @@ impl<'a> Fusion<'a> {
         all.enumerate().map(|(number, (drive, pass))| (drive, number, pass)).filter(move |(drive, ..)| placed[*drive])
     }
 
-    /// Lays every drive, pass by pass, on the lines of those before it; those that fit nowhere once more at the end. The
-    /// beginning before the drive that is asked for.
-    fn place_all(&mut self, mut laying: Laying, keep: Option<usize>) -> Option<Beginning> {
-        let mut kept = None;
-        for drive in laying.drives..self.drives.len() {
-            if keep == Some(drive) {
-                kept = Some(self.beginning(&laying));
-            }
-            if self.placed[drive] && !self.place_drive(drive, laying.passes, &mut laying.pieces, false) {
-                laying.later.push((drive, laying.passes));
-            }
-            laying.passes += self.drives[drive].passes.len();
-            laying.drives += 1;
-        }
-        if self.are_outvoted(&laying) {
-            self.begin_with_refused(&mut laying);
-        }
-        for (drive, first_pass) in laying.later {
-            self.placed[drive] = self.place_drive(drive, first_pass, &mut laying.pieces, true);
-        }
-        kept
-    }
-
-    /// Whether more drives fit nowhere than were laid: then those lie wrong, though they came first.
-    fn are_outvoted(&self, laying: &Laying) -> bool {
-        let laid = self.is_laid.iter().filter(|is_laid| **is_laid).count();
-        laying.later.len() > laid + self.base.drives()
-    }
-
-    /// Begins anew with the drives that fitted nowhere; those that were laid are to fit what comes of them.
-    fn begin_with_refused(&mut self, laying: &mut Laying) {
-        let first_passes = self.drives.iter().scan(0, |next, drive| {
-            let first = *next;
-            *next += drive.passes.len();
-            Some(first)
-        });
-        let laid = first_passes.enumerate().filter(|(drive, _)| self.is_laid[*drive]).collect::<Vec<_>>();
-        let refused = std::mem::take(&mut laying.later);
-        *self = Self::new(self.base, self.drives, self.params);
-        laying.pieces = Pieces::new();
-        for (drive, first_pass) in refused {
-            if !self.place_drive(drive, first_pass, &mut laying.pieces, false) {
-                laying.later.push((drive, first_pass));
-            }
-        }
-        laying.later.extend(laid);
-    }
-
-    /// Lays one drive on the lines and adds it to them; whether it was found.
-    fn place_drive(&mut self, drive: usize, first_pass: usize, pieces: &mut Pieces, is_last_chance: bool) -> bool {
-        let prepared = &self.drives[drive];
-        for (index, pass) in prepared.passes.iter().enumerate() {
-            let sigma_m = if index == 0 { self.restraints[drive].place_sigma_m } else { self.params.gnss_bias_sigma_m };
-            match self.lay(drive, pass, sigma_m, is_last_chance) {
-                Placement::Refused if index == 0 => return false,
-                // A later pass that fits nowhere lies where odometry puts it after the one before.
-                Placement::Alone | Placement::Refused => {}
-                Placement::Found(sightings) => {
-                    let before = &prepared.passes[..index];
-                    let mut all = self.sightings_of(drive, before);
-                    all.extend(sightings);
-                    self.fit_one(drive, all, UNBOUNDED_M);
-                    for robust_scale_m in [3.0, 1.0].map(|factor| factor * self.params.robust_scale_m) {
-                        let sightings = self.sightings_of(drive, &prepared.passes[..=index]);
-                        self.fit_one(drive, sightings, robust_scale_m);
-                    }
-                }
-            }
-            self.grow(drive, first_pass + index, pass, pieces);
-            self.ways.add(pass.way, &self.corrections[drive]);
-            self.is_laid[drive] = true;
-        }
-        self.placed[drive] = true;
-        true
-    }
-
+    /// Adds a pass of a drive to the lines.
     fn grow(&mut self, drive: usize, number: usize, pass: &PreparedPass<'_>, pieces: &mut Pieces) {
         let contribution = self.drives[drive].contribution;
         let growing = Growing { contribution, pass, drive, number, params: self.params };
         growing.add_to(&mut self.lines, &self.corrections[drive], pieces);
-    }
-
-    /// Solves for one drive's correction while the lines stay.
-    fn fit_one(&mut self, drive: usize, mut sightings: Vec<Sighting>, robust_scale_m: f64) {
-        for sighting in &mut sightings {
-            sighting.drive = 0;
-        }
-        let scales = RobustScales { lanes_m: robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
-        align_one(&self.restraints[drive], &mut self.corrections[drive], &sightings, scales);
-    }
-
-    /// Where lanes of some passes of a drive lie on lines.
-    fn sightings_of(&self, drive: usize, passes: &[PreparedPass<'_>]) -> Vec<Sighting> {
-        let mut sightings = Vec::new();
-        let deflation = self.params.lane_correlation_m / (COARSE_STRIDE as f64 * self.params.sample_m);
-        for pass in passes {
-            let matched = match_lanes(&pass.coarse_lanes, &self.corrections[drive], &self.lines, self.params);
-            for (lane, run) in
-                pass.coarse_lanes.iter().zip(&matched).flat_map(|(lane, runs)| runs.iter().map(move |run| (lane, run)))
-            {
-                let Some(curve) = self.lines.lines[run.line].curve() else { continue };
-                let on_line = lane.samples[run.samples.clone()].iter().zip(&run.parameters);
-                sightings.extend(on_line.map(|(sample, parameter)| {
-                    let (place, normal) = (curve.point(*parameter), normal_of(&curve.derivative(*parameter)));
-                    Sighting {
-                        drive,
-                        arc_m: sample.arc_m,
-                        map: sample.map,
-                        normal,
-                        across: Target::Fixed(place.coords.xy().dot(&normal)),
-                        height: Target::Fixed(place.z),
-                        lateral_variance_m2: sample.lateral_variance_m2 * deflation,
-                        height_variance_m2: sample.height_variance_m2 * deflation,
-                    }
-                }));
-            }
-        }
-        sightings
     }
 
     /// Solves for all corrections and all lines together.
@@ -450,70 +329,5 @@ impl<'a> Fusion<'a> {
         self.lines.index();
         self.part_moved(&mut pieces);
         self.lines.index();
-    }
-
-    /// Takes out drives that went where others did, by what their receivers say, and share no line with them; whether any.
-    ///
-    /// A drive on a road of its own shares none either, but others are not near its way. Beside a road that is well known, two that
-    /// share their lines with each other alone are not yet believed either: they may be wrong alike.
-    fn keep_apart_strangers(&mut self) -> bool {
-        const MANY: u32 = 6;
-        let mut shared = vec![(0_usize, 0_usize, 0_usize); self.drives.len()];
-        for knot in self.lines.lines.iter().flat_map(|line| &line.knots) {
-            let (several, more) = (knot.drives() > 1, knot.drives() > 2);
-            for witness in knot.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
-                let (with_others, with_more, all) = &mut shared[witness.drive];
-                *with_others += usize::from(several);
-                *with_more += usize::from(more);
-                *all += 1;
-            }
-        }
-        let strangers = shared.iter().enumerate().filter(|(drive, (with_others, with_more, all))| {
-            let is_alone = (*with_others as f64) < self.params.least_shared * *all as f64;
-            let has_few = (*with_more as f64) < self.params.least_shared * *all as f64;
-            self.placed[*drive]
-                && (is_alone && self.goes_where_others_do(*drive, 2)
-                    || has_few && self.goes_where_others_do(*drive, MANY))
-        });
-        let strangers: Vec<usize> = strangers.map(|(drive, _)| drive).collect();
-        for drive in &strangers {
-            self.placed[*drive] = false;
-        }
-        !strangers.is_empty()
-    }
-
-    /// Whether most of a drive's way lies near lines that at least so many drives saw.
-    fn goes_where_others_do(&self, drive: usize, least_drives: u32) -> bool {
-        const STRIDE: usize = 5;
-        let way: Vec<_> = self.drives[drive].contribution.trajectory.iter().step_by(STRIDE).collect();
-        let near_others = way.iter().filter(|point| {
-            let place = self.corrections[drive].apply(&point.position, point.arc_m);
-            let near = self.lines.near(&place, self.params.strangers_within_m);
-            near.into_iter().any(|(line, knot)| self.lines.lines[line].knots[knot].drives() >= least_drives)
-        });
-        2 * near_others.count() > way.len()
-    }
-
-    /// Takes out drives whose lanes do not lie where those of others do, though they were laid on them; whether any.
-    fn keep_apart_misfits(&mut self) -> bool {
-        let mut residuals: Vec<Vec<f64>> = vec![Vec::new(); self.drives.len()];
-        for line in &self.lines.lines {
-            for (knot, at) in line.knots.iter().enumerate().filter(|(_, at)| at.witnesses.len() >= 3) {
-                let normal = normal_of(&line.tangent(knot));
-                for witness in at.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
-                    residuals[witness.drive].push((witness.shared - line.points[knot]).xy().dot(&normal).abs());
-                }
-            }
-        }
-        let mut any = false;
-        for (drive, residuals) in residuals.iter_mut().enumerate() {
-            residuals.sort_by(f64::total_cmp);
-            let middle = residuals.get(residuals.len() / 2).copied().unwrap_or(0.0);
-            if self.placed[drive] && middle > self.params.most_misfit_m {
-                self.placed[drive] = false;
-                any = true;
-            }
-        }
-        any
     }
 }

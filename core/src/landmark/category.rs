@@ -5,7 +5,7 @@
 //! Sightings of one burst of confusion are not independent, so each counts for less than one (`VOTE`).
 //!
 //! A lane may go on where its paint changes: beside what it is as a whole, each of its knots counts what it was seen as. A frame
-//! sees about [`SEEN_KNOTS`] knots at once, so at each it counts for that share of a vote. Stretches of one category are the
+//! sees about `SEEN_KNOTS` knots at once, so at each it counts for that share of a vote. Stretches of one category are the
 //! best sequence of categories along the lane with a price for each change (Viterbi).
 
 use std::collections::VecDeque;

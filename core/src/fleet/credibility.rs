@@ -43,8 +43,8 @@ pub(super) fn learned_doubts(lines: &[Line], drives: usize) -> Vec<f64> {
     scatters.into_iter().map(doubt).collect()
 }
 
-/// Standard deviation of what each drive says across its lines, against what all say; `None` where too little is known.
-fn scatters_m(lines: &[Line], drives: usize) -> Vec<Option<f64>> {
+/// How far what each drive says lies from where all say the line is, across, metres; its knots in any order.
+pub(super) fn offsets_m(lines: &[Line], drives: usize) -> Vec<Vec<f64>> {
     let mut offsets: Vec<Vec<f64>> = vec![Vec::new(); drives];
     for line in lines {
         for (knot, at) in line.knots.iter().enumerate().filter(|(_, at)| at.witnesses.len() >= LEAST_WITNESSES) {
@@ -54,12 +54,17 @@ fn scatters_m(lines: &[Line], drives: usize) -> Vec<Option<f64>> {
             }
         }
     }
+    offsets
+}
+
+/// Standard deviation of what each drive says across its lines, against what all say; `None` where too little is known.
+fn scatters_m(lines: &[Line], drives: usize) -> Vec<Option<f64>> {
     let scatter = |mut offsets: Vec<f64>| {
         offsets.sort_by(f64::total_cmp);
         let at = count_of(offsets.len() as f64 * QUANTILE);
         (offsets.len() >= LEAST_OFFSETS).then(|| offsets[at] / QUANTILE_OF_NORMAL)
     };
-    offsets.into_iter().map(scatter).collect()
+    offsets_m(lines, drives).into_iter().map(scatter).collect()
 }
 
 #[cfg(test)]

@@ -1,6 +1,10 @@
 //! Which drives are kept apart though they were laid: those whose lanes do not fit, and those that lie beside all others.
 
-use super::{Fusion, normal_of};
+use super::Fusion;
+use crate::fleet::credibility::offsets_m;
+
+/// Drives that saw a line that is well known.
+const MANY: u32 = 6;
 
 impl Fusion<'_> {
     /// Takes out drives that went where others did, by what their receivers say, and share no line with them; whether any.
@@ -8,7 +12,6 @@ impl Fusion<'_> {
     /// A drive on a road of its own shares none either, but others are not near its way. Beside a road that is well known, two that
     /// share their lines with each other alone are not yet believed either: they may be wrong alike.
     pub(super) fn keep_apart_strangers(&mut self) -> bool {
-        const MANY: u32 = 6;
         let mut shared = vec![(0_usize, 0_usize, 0_usize); self.drives.len()];
         for knot in self.lines.lines.iter().flat_map(|line| &line.knots) {
             let (several, more) = (knot.drives() > 1, knot.drives() > 2);
@@ -47,20 +50,12 @@ impl Fusion<'_> {
 
     /// Takes out drives whose lanes do not lie where those of others do, though they were laid on them; whether any.
     pub(super) fn keep_apart_misfits(&mut self) -> bool {
-        let mut residuals: Vec<Vec<f64>> = vec![Vec::new(); self.drives.len()];
-        for line in &self.lines.lines {
-            for (knot, at) in line.knots.iter().enumerate().filter(|(_, at)| at.witnesses.len() >= 3) {
-                let normal = normal_of(&line.tangent(knot));
-                for witness in at.witnesses.iter().filter(|witness| witness.drive < self.drives.len()) {
-                    residuals[witness.drive].push((witness.shared - line.points[knot]).xy().dot(&normal).abs());
-                }
-            }
-        }
+        let mut offsets_m = offsets_m(&self.lines.lines, self.drives.len());
         let mut any = false;
-        for (drive, residuals) in residuals.iter_mut().enumerate() {
-            residuals.sort_by(f64::total_cmp);
-            let middle = residuals.get(residuals.len() / 2).copied().unwrap_or(0.0);
-            if self.placed[drive] && middle > self.params.most_misfit_m {
+        for (drive, offsets_m) in offsets_m.iter_mut().enumerate() {
+            offsets_m.sort_by(f64::total_cmp);
+            let middle_m = offsets_m.get(offsets_m.len() / 2).copied().unwrap_or(0.0);
+            if self.placed[drive] && middle_m > self.params.most_misfit_m {
                 self.placed[drive] = false;
                 any = true;
             }

@@ -1,6 +1,7 @@
 //! One lane of the map: how it grows, what is known of its control points, whether it exists, and what it is painted as.
 
 pub mod category;
+pub mod clean_up;
 pub mod duplicate;
 pub mod existence;
 pub mod extent;

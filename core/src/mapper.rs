@@ -21,7 +21,7 @@ use crate::{
         pose::without_negative_zeros,
     },
     landmark::{
-        Landmark, duplicate,
+        Landmark, clean_up, duplicate,
         existence::DETECTION,
         index::{LaneIndex, NearbyRun},
         information::Knot,
@@ -35,7 +35,7 @@ use crate::{
 use scene::Scene;
 
 /// Version of the bytes that [`Mapper::snapshot`] writes.
-const SNAPSHOT_VERSION: u16 = 8;
+const SNAPSHOT_VERSION: u16 = 9;
 
 /// A mapper of one drive. Deterministic: the same frames give the same bytes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -230,6 +230,7 @@ impl Mapper {
         }
         let near = scene::near_knots(lane, run);
         Self::take_in(lane, observation, time, &self.pose.map_from_vehicle, near, &self.sensor, &self.params);
+        lane.seen_at_frame = self.frames;
         self.seen_now.push(run.lane);
         self.index.update(run.lane, lane.information(), near.0, near.1, self.way_m);
         grown
@@ -240,7 +241,7 @@ impl Mapper {
         let id = LaneId(self.last_lane + 1);
         let pose = &self.pose.map_from_vehicle;
         let mut lane = Landmark::begin(id, observation, pose, time, &self.params)?;
-        lane.born_at_frame = self.frames;
+        (lane.born_at_frame, lane.seen_at_frame) = (self.frames, self.frames);
         self.last_lane += 1;
         let all = lane.knots();
         Self::take_in(&mut lane, observation, time, &self.pose.map_from_vehicle, all, &self.sensor, &self.params);
@@ -418,6 +419,24 @@ impl Mapper {
     pub fn lane_map(&self) -> LaneMap {
         let shown = self.lanes.values().filter(|lane| local_map::is_published(lane, &self.params));
         LaneMap { lanes: shown.filter_map(|lane| local_map::map_lane(lane, &self.params)).collect() }
+    }
+
+    /// Whether [`Mapper::finished_lane_map`] may be another map than [`Mapper::lane_map`].
+    #[must_use]
+    pub fn cleans_up(&self) -> bool {
+        self.params.landmark.clean_up.is_some()
+    }
+
+    /// The map of a drive that is over: [`Mapper::lane_map`] after the preset's [`clean_up`], where it has one.
+    #[must_use]
+    pub fn finished_lane_map(&self) -> LaneMap {
+        let params = &self.params.landmark;
+        let LaneMap { mut lanes } = self.lane_map();
+        if let Some(rule) = &params.clean_up {
+            let given_up = clean_up::given_up(self.lanes.values(), rule, params);
+            lanes.retain(|lane| !given_up.contains(&lane.id));
+        }
+        LaneMap { lanes }
     }
 
     /// The map around the vehicle at the last frame, in its own axes.

@@ -244,6 +244,21 @@ pub struct LandmarkParams {
     pub shown_in_image_m: f64,
     /// A lane is shown in the local map if this much of it lies in the window, metres.
     pub shown_in_window_m: f64,
+    /// Which lanes are given up once the drive is over; `None`: none (`default`).
+    pub clean_up: Option<CleanUpParams>,
+}
+
+/// Parameters of [`crate::landmark::clean_up`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CleanUpParams {
+    /// Lanes seen in fewer frames than this are given up (authors: 10).
+    pub least_observations: u32,
+    /// So are those that a smaller share of the frames saw, from their first to their last (authors: 0.5).
+    pub least_share_of_span: f64,
+    /// So is the shorter of two of which it shares more than this with the other (authors: 0.7).
+    pub most_overlap: f64,
+    /// Distance within which two lanes share a point, metres (authors: 1.75).
+    pub within_m: f64,
 }
 
 impl Params {
@@ -312,6 +327,12 @@ impl Params {
                 left_behind_m: f64::INFINITY,
                 shown_in_image_m: 0.0,
                 shown_in_window_m: 0.0,
+                clean_up: Some(CleanUpParams {
+                    least_observations: 10,
+                    least_share_of_span: 0.5,
+                    most_overlap: 0.7,
+                    within_m: 1.75,
+                }),
             },
             line_error: LineErrorParams { enabled: false, step_m: 0.5, ..Self::mended().line_error },
         }
@@ -404,6 +425,7 @@ impl Params {
                 left_behind_m: 300.0,
                 shown_in_image_m: 8.0,
                 shown_in_window_m: 5.0,
+                clean_up: None,
             },
             line_error: LineErrorParams {
                 enabled: true,

@@ -190,6 +190,14 @@ impl Journal {
         self.commit(Write::Record(record)).await
     }
 
+    /// Makes it durable that a session's drive is over, with what is told of it from now on.
+    ///
+    /// # Errors
+    /// No room on the disk, or the store failed: the drive is not over.
+    pub async fn put_ended(&self, record: SessionRecord, summary: Vec<u8>) -> Result<(), JournalError> {
+        self.commit(Write::Ended { record, summary }).await
+    }
+
     /// Makes a snapshot durable and removes the frames that it makes needless, in one step.
     ///
     /// # Errors

@@ -53,7 +53,13 @@ impl Drive {
     /// What a mapper makes of the drive, with no service between.
     #[must_use]
     pub fn mapped(&self) -> Mapper {
-        let mut mapper = Mapper::new(Params::preset(Preset::Default), self.sensor);
+        self.mapped_by(Preset::Default)
+    }
+
+    /// The same by either mapper.
+    #[must_use]
+    pub fn mapped_by(&self, preset: Preset) -> Mapper {
+        let mut mapper = Mapper::new(Params::preset(preset), self.sensor);
         for frame in &self.frames {
             mapper.step(frame);
         }

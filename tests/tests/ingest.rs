@@ -46,6 +46,41 @@ async fn a_streamed_drive_gives_the_bytes_of_a_local_mapper() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_map_of_a_paper_drive_is_cleaned_up_under_a_version_of_its_own_once_it_is_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = servers::start(folder.path()).await;
+    let drive = drives::simulated(5, 150);
+    let mapper = drive.mapped_by(Preset::Paper);
+    let (under_way, finished) = (mapper.lane_map(), mapper.finished_lane_map());
+    assert!(!finished.lanes.is_empty() && finished.lanes.len() < under_way.lanes.len(), "or this test shows nothing");
+
+    let start = || SessionStart { preset: Preset::Paper, ..drive.start() };
+    let client = IngestClient::connect(server.url()).await.unwrap();
+    let (mut session, _events) = client.start_session(start()).await.unwrap();
+    for frame in &drive.frames {
+        session.send(frame).await.unwrap();
+    }
+    let id = session.id().parse().unwrap();
+    while server.sessions().get(&id).is_none_or(|told| told.version.0 < 150) {
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+    assert_eq!(*server.sessions().get(&id).unwrap().map, under_way);
+    session.finish().await.unwrap();
+
+    let is_finished = |server: &lanemap_server::RunningServer| {
+        // The list first: what it tells must not depend on whether the map was read.
+        let listed = server.sessions().list()[0].clone();
+        let told = server.sessions().get(&id).unwrap();
+        assert_eq!((listed.state, listed.version.0), (SessionState::Closed, 151));
+        assert_eq!((told.version.0, told.lanes, listed.lanes), (151, finished.lanes.len(), finished.lanes.len()));
+        assert_eq!(*told.map, finished);
+    };
+    is_finished(&server);
+    server.shutdown().await;
+    is_finished(&servers::start(folder.path()).await);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn http_serves_the_same_bytes_as_grpc() {
     let folder = tempfile::tempdir().unwrap();
     let server = servers::start(folder.path()).await;

@@ -204,7 +204,7 @@ impl<'a> DriveRun<'a> {
     async fn finish(mut self, name: &str, faults: Vec<Fault>) -> DriveReport {
         let mut session = None;
         if let Some(stream) = self.stream.take() {
-            match stream.finish(&self.mapper.mapper().lane_map()).await {
+            match stream.finish(&self.mapper.mapper().finished_lane_map()).await {
                 Ok(report) => session = Some(report),
                 Err(error) => self.fail(name, &error),
             }

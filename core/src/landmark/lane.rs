@@ -49,6 +49,8 @@ pub struct Landmark {
     pub observations: u32,
     /// Number of the frame that began it, counted by its mapper.
     pub born_at_frame: u64,
+    /// Number of the last frame that saw it.
+    pub seen_at_frame: u64,
     /// Time of the first frame that saw it.
     pub first_seen: TimestampNs,
     /// Time of the last frame that saw it.
@@ -143,6 +145,7 @@ impl Landmark {
             extent: Extent::default(),
             observations: 0,
             born_at_frame: 0,
+            seen_at_frame: 0,
             first_seen: time,
             last_seen: time,
             retired: false,
@@ -466,6 +469,7 @@ impl Landmark {
         self.observations += other.observations;
         self.first_seen = self.first_seen.min(other.first_seen);
         self.last_seen = self.last_seen.max(other.last_seen);
+        self.seen_at_frame = self.seen_at_frame.max(other.seen_at_frame);
         let mut extent = std::mem::take(&mut self.extent);
         let mut category_along = std::mem::take(&mut self.category_along);
         if let (Some(mine), Some(theirs)) = (self.curve(params.ends), other.curve(params.ends)) {

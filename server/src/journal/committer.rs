@@ -34,6 +34,8 @@ pub(super) enum Write {
     Frames { session: SessionId, frames: Vec<JournalFrame> },
     /// A session's record.
     Record(SessionRecord),
+    /// The record of a drive that is over, and what is told of it.
+    Ended { record: SessionRecord, summary: Vec<u8> },
     /// A snapshot, and the frames that it covers are removed.
     Snapshot { session: SessionId, snapshot: Snapshot },
     /// What was removed up to `since` has left the disk.
@@ -211,6 +213,7 @@ fn add(batch: &mut StoreBatch<'_>, write: Write) -> Result<(), JournalError> {
             Ok(())
         }
         Write::Record(record) => batch.put_record(&record),
+        Write::Ended { record, summary } => batch.put_ended(&record, summary),
         Write::Snapshot { session, snapshot } => batch.put_snapshot(session, snapshot),
         Write::Erased { since } => batch.erased(&since),
         Write::CutMark { session, mark } => {

@@ -201,6 +201,12 @@ impl StoreBatch<'_> {
         Ok(())
     }
 
+    /// Puts the record of a drive that is over, and what is told of it.
+    pub(super) fn put_ended(&mut self, record: &SessionRecord, summary: Vec<u8>) -> Result<(), JournalError> {
+        self.batch.insert(&self.store.summaries, record.id.to_key(), summary);
+        self.put_record(record)
+    }
+
     /// Puts the snapshot and removes the frames that it covers.
     pub(super) fn put_snapshot(&mut self, session: SessionId, snapshot: Snapshot) -> Result<(), JournalError> {
         let Snapshot { covered_before, covered, state, summary, erase } = snapshot;

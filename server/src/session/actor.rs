@@ -419,7 +419,9 @@ impl Actor {
             self.end_trip();
             self.save().await?;
             self.record.ended = true;
-            self.surroundings.journal.put_record(self.record.clone()).await?;
+            // Its map may be another one now that it is over.
+            let summary = self.drive.summary_bytes(self.record.id, SessionState::Closed)?;
+            self.surroundings.journal.put_ended(self.record.clone(), summary).await?;
         }
         let acked_sequence_inclusive = self.drive.last_sequence().map(|sequence| sequence.0);
         self.publish();

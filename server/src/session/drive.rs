@@ -389,7 +389,8 @@ impl Drive {
 
     /// What readers are shown.
     pub(crate) fn published(&mut self, session: SessionId, state: SessionState) -> PublishedMap {
-        let version = MapVersion(self.progress.mapped);
+        let is_cleaned_up = state == SessionState::Closed && self.mapper.cleans_up();
+        let version = MapVersion(self.progress.mapped + u64::from(is_cleaned_up));
         let summary = SessionSummary {
             session,
             version,
@@ -402,17 +403,18 @@ impl Drive {
             lanes: 0,
             extent: None,
         };
-        PublishedMap::new(summary, self.lane_map(version), self.way.clone())
+        PublishedMap::new(summary, self.lane_map(version, is_cleaned_up), self.way.clone())
     }
 
     /// The map of this version: made once, for its covariances cost as much as many steps of the mapper.
-    fn lane_map(&mut self, version: MapVersion) -> Arc<LaneMap> {
+    fn lane_map(&mut self, version: MapVersion, is_cleaned_up: bool) -> Arc<LaneMap> {
         if let Some((shown, map)) = &self.shown
             && *shown == version
         {
             return Arc::clone(map);
         }
-        let map = Arc::new(self.mapper.lane_map());
+        let map = if is_cleaned_up { self.mapper.finished_lane_map() } else { self.mapper.lane_map() };
+        let map = Arc::new(map);
         self.shown = Some((version, Arc::clone(&map)));
         map
     }

@@ -32,7 +32,8 @@ use super::{
 };
 use crate::journal::{JournalError, SessionRecord};
 
-/// Version of a session's map: the number of frames in it. The same version of a session always has the same map.
+/// Version of a session's map: the number of frames in it, and one more once a drive is over whose map the mapper then
+/// cleans up (`paper`). The same version of a session always has the same map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct MapVersion(pub u64);
 
@@ -59,7 +60,7 @@ pub enum SessionState {
 pub struct SessionSummary {
     /// The session.
     pub session: SessionId,
-    /// Number of frames in the map.
+    /// Version of the map.
     pub version: MapVersion,
     /// Whether frames are coming. May change without a new version.
     pub state: SessionState,

@@ -58,7 +58,7 @@ impl DriveReport {
         Self {
             name: name.to_owned(),
             frames: run.map_or(0, MapperRun::steps),
-            lanes: run.map_or(0, |run| run.mapper().lane_map().lanes.len()),
+            lanes: run.map_or(0, |run| run.mapper().finished_lane_map().lanes.len()),
             length_m: run.map_or(0.0, MapperRun::driven_m),
             step_us: StepTimes::figures([&times]),
             step_us_per_km: times.means_per_km_us(),

@@ -254,6 +254,7 @@ fn finite(value: f64, field: impl FnOnce() -> String) -> Result<(), DecodeError>
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use prost::Message;
 
     use super::*;
     use crate::encode;
@@ -277,6 +278,37 @@ mod tests {
             prop_assert_eq!(covariance, covariance.transpose());
             prop_assert_eq!(encode::tangent_covariance(&covariance), message);
         }
+    }
+
+    #[test]
+    fn a_lane_map_crosses_the_wire_whole_with_the_stretches_that_are_painted_alike() {
+        let uniform = vec![1.0 / 15.0; Category::ALL.len()];
+        let solid = |to: f64| {
+            let mut posterior = vec![0.1 / 14.0; Category::ALL.len()];
+            posterior[2] = 0.9;
+            CategoryStretch { to, posterior }
+        };
+        let covariance = Matrix3::new(0.04, 0.01, 0.002, 0.01, 0.09, 0.003, 0.002, 0.003, 0.16);
+        let control_points =
+            (0..4).map(|k| ControlPoint { position: Point3::new(3.0 * f64::from(k), 1.75, -0.1), covariance });
+        let lane = MapLane {
+            id: LaneId(7),
+            category: Category::WhiteDashed,
+            category_posterior: uniform.clone(),
+            category_stretches: vec![CategoryStretch { to: 1.5, posterior: uniform }, solid(3.0)],
+            control_points: control_points.collect(),
+            ends: EndRule::Reflected,
+            drawn_from: 0.25,
+            drawn_to: 2.75,
+            existence: 0.97,
+            observations: 42,
+            first_seen: TimestampNs(1_000_000_007),
+            last_seen: TimestampNs(9_000_000_011),
+        };
+        let map = LaneMap { lanes: vec![lane.clone(), MapLane { id: LaneId(8), ends: EndRule::Open, ..lane }] };
+        let message = v1::LaneMap { lanes: map.lanes.iter().map(encode::lane).collect(), ..v1::LaneMap::default() };
+        let bytes = message.encode_to_vec();
+        assert_eq!(lane_map(&v1::LaneMap::decode(bytes.as_slice()).unwrap()), Ok(map));
     }
 
     #[test]

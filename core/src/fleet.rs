@@ -10,7 +10,8 @@
 //!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky; how far
 //!    receivers (`receivers`) and drives (`credibility`) are believed is learned on the way.
-//! 5. [`base`]: where drives crowd, the oldest are folded (`crowding`), so that a place costs no more the more often it is driven.
+//! 5. [`base`]: where drives crowd, the oldest are folded (`crowding`), so that a place costs no more the more often it is driven;
+//!    where a cell is full, [`redundancy`] says which drives are missed least.
 //! 6. [`change`]: what is there no more, what is new, and what was moved, from who saw what and who missed it
 //!    (`persistence`, `moved`), the most likely history of each stretch (`history`), and that of its paint (`repainted`).
 //! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness; where
@@ -79,6 +80,7 @@ pub mod placement;
 mod potts;
 mod prepared;
 mod receivers;
+pub mod redundancy;
 mod repainted;
 mod shown;
 mod sparse;
@@ -96,4 +98,5 @@ pub use fusion::{
 };
 pub use line::{FusedLane, FusedLaneId, FusedPoint};
 pub use params::FleetParams;
+pub use redundancy::{Visits, missed_least};
 pub use trace::Trace;

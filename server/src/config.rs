@@ -147,7 +147,8 @@ pub struct ServerConfig {
     pub fuse_interval_ms: u64,
     /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work.
     pub fuse_cpu_share: f64,
-    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped.
+    /// Drives from which a cell is fused, at least 1. Of more, what is missed least is dropped: the oldest whose ways a crowd
+    /// of younger ones went as well.
     pub max_contributions_per_cell: usize,
     /// Kilometres of line up to which drives without GNSS are sought on the shared map, 0 to 1e6; 0: they stay in their own
     /// frames. A search takes some 0.2 s of a fusing thread for 40 km of line.

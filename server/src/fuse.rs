@@ -18,6 +18,7 @@ pub(crate) mod border;
 mod cell_record;
 pub mod events;
 pub mod follow;
+mod footprints;
 mod lineage;
 pub mod localizing;
 pub(crate) mod offer;
@@ -56,6 +57,7 @@ use crate::{
 };
 use bases::Bases;
 use cell_record::{FORMAT, fingerprint};
+use footprints::Footprints;
 use localizing::{SearchedMap, Sought};
 use publications::Publications;
 use queue::Queue;
@@ -102,6 +104,7 @@ struct Shared {
     map: SharedMap,
     queue: Mutex<Queue>,
     bases: Bases,
+    footprints: Footprints,
     /// The map as drives without GNSS are sought on it.
     searched: Mutex<SearchedMap>,
     /// Told when there is more in the queue, or nothing more will come.
@@ -163,6 +166,7 @@ impl Fuser {
             map,
             queue: Mutex::new(queue),
             bases: Bases::new(),
+            footprints: Footprints::new(),
             searched: Mutex::default(),
             woken: Condvar::new(),
             recovered: AtomicBool::new(false),

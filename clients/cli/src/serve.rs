@@ -225,7 +225,8 @@ pub struct ServeArgs {
     /// [env: LANEMAP_FUSE_CPU_SHARE] [default: 0.5]
     #[arg(long, value_name = "SHARE")]
     fuse_cpu_share: Option<f64>,
-    /// Drives from which a cell is fused, at least 1: the youngest; what older ones said of it is dropped
+    /// Drives from which a cell is fused, at least 1. Of more, what is missed least is dropped: the oldest whose ways a crowd
+    /// of younger ones went as well
     /// [env: LANEMAP_MAX_CONTRIBUTIONS_PER_CELL] [default: 256]
     #[arg(long, value_name = "N")]
     max_contributions_per_cell: Option<usize>,

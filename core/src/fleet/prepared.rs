@@ -161,7 +161,7 @@ impl<'a> PreparedDrive<'a> {
 }
 
 impl Restraints {
-    fn new(contribution: &Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
+    pub(super) fn new(contribution: &Contribution, anchor: &Anchor, params: &FleetParams) -> Self {
         let (trajectory, placed_by) = (contribution.trajectory.as_slice(), contribution.placed_by);
         let mut fixes: Vec<SharedFix> = trajectory.iter().filter_map(|point| shared_fix(point, anchor)).collect();
         let mean = |axis: usize| fixes.iter().map(|fix| fix.sigma_m[axis]).sum::<f64>() / fixes.len().max(1) as f64;

@@ -183,7 +183,7 @@ impl Worker {
     /// Brings a cell up to date: fuses it where it is not fused from what the store has, and joins it with its neighbours.
     fn fuse(&self, cell: CellId) -> Result<(), JournalError> {
         let mut facts = self.store.facts_of(cell)?;
-        let dropped = self.drop_oldest(&mut facts);
+        let dropped = self.drop_least_missed(cell, &mut facts)?;
         let before = self.fuser.shared.map.record(cell);
         let before = before.as_deref().cloned().unwrap_or_default();
         let purged = self.store.purges()?.contains(&cell);
@@ -232,7 +232,7 @@ impl Worker {
             let bytes = next.encode_to_vec();
             (next, bytes)
         });
-        if fused.is_some() || next.is_some() || purged {
+        if fused.is_some() || next.is_some() || purged || !dropped.is_empty() {
             let published = published.unwrap_or_else(|| Arc::new(wire::empty_cell(cell)));
             let past = Past { map: published, known, told, dropped, purged };
             self.write(cell, record.clone(), fused.as_ref(), next, past)?;
@@ -327,16 +327,15 @@ impl Worker {
         now_ms().saturating_sub(u64::try_from(kept.as_millis()).unwrap_or(u64::MAX))
     }
 
-    /// Takes the oldest drives out, where there are more than a cell keeps.
-    fn drop_oldest(&self, facts: &mut Facts) -> Vec<SessionId> {
-        let excess = facts.len().saturating_sub(self.fuser.shared.settings.max_contributions);
-        let mut by_age: Vec<(_, SessionId)> = facts.iter().map(|(session, fact)| (*fact, *session)).collect();
-        by_age.sort_unstable();
-        let dropped: Vec<SessionId> = by_age.into_iter().take(excess).map(|(_, session)| session).collect();
+    /// Takes the drives out that are missed least, where there are more than a cell keeps.
+    fn drop_least_missed(&self, cell: CellId, facts: &mut Facts) -> Result<Vec<SessionId>, JournalError> {
+        let most = self.fuser.shared.settings.max_contributions;
+        let read = |session| self.store.contribution(cell, session);
+        let dropped = self.fuser.shared.footprints.missed_least(cell, facts, most, read)?;
         for session in &dropped {
             facts.remove(session);
         }
-        dropped
+        Ok(dropped)
     }
 
     fn fuse_from(&self, cell: CellId, facts: &Facts) -> Result<Fused, JournalError> {

@@ -12,7 +12,7 @@ use crate::{
     },
     journal::{
         JournalError,
-        cells::{Contributed, ContributionFact, Facts, OwnFrame, StoredContribution, encoded},
+        cells::{Contributed, OwnFrame, StoredContribution, encoded},
     },
     session::{MapVersion, SessionId},
     telemetry,
@@ -93,9 +93,7 @@ impl Worker {
         let mut kept = Vec::with_capacity(changed.len());
         for contribution in changed.drain(..) {
             let known = self.store.facts_of(contribution.cell)?;
-            if known.get(&session) != Some(&contribution.fact)
-                && self.is_young_enough(&known, session, &contribution.fact)
-            {
+            if known.get(&session) != Some(&contribution.fact) {
                 kept.push(contribution);
             }
         }
@@ -110,13 +108,5 @@ impl Worker {
             queue.touch_cell(cell, Instant::now());
         }
         Ok(())
-    }
-
-    /// Whether a contribution is among those that its cell keeps: the youngest drives.
-    fn is_young_enough(&self, known: &Facts, session: SessionId, fact: &ContributionFact) -> bool {
-        let younger = known
-            .iter()
-            .filter(|(other, known)| **other != session && (known.started, known.drive) > (fact.started, fact.drive));
-        younger.count() < self.fuser.shared.settings.max_contributions
     }
 }

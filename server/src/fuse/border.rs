@@ -1,10 +1,15 @@
 //! Borders: a cell's lines are cut where its tile ends, and joined with those of the next cell.
 //!
 //! Cells on both sides of a border are fused from the same drives around it, but each from others farther away, so that
-//! their lines meet a little beside each other. The smaller of the two cells owns the border: where a line of each crosses
-//! it within [`MOST_APART_M`], in the same direction or the opposite one, the two are one line. The larger cell then moves
-//! the end of its piece to the owner's crossing, and the way there with it, tapering off over [`TAPER_M`]. What a cell
-//! shows is a pure function of its own lines and of its neighbours' crossings: whoever is fused first, the result is the same.
+//! their lines meet a little beside each other. [`matching`] tells which crossings are of one line. Both pieces of it then
+//! end half way between the two, and the way there is moved with its end, by less and less: over [`TAPER_M`], and over so much
+//! more that no line bends by more than [`MOST_BEND`] for it. What a point is moved by is added to its variance. What a cell
+//! shows is a pure function of its own lines and of its neighbours' crossings as they were fused: whoever is fused first, the
+//! result is the same, and no cell follows another that follows it.
+
+mod matching;
+#[cfg(test)]
+mod tests;
 
 use lanemap_core::{
     Category, EndRule, TimestampNs,
@@ -15,10 +20,10 @@ use lanemap_core::{
 use nalgebra::{Point3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Farthest that two crossings of one line lie apart, metres.
-const MOST_APART_M: f64 = 0.5;
-/// Way over which a piece is moved to meet the next one, metres.
+/// Least way over which a piece is moved to meet the next one, metres.
 const TAPER_M: f64 = 24.0;
+/// Most that a piece is turned by to meet the next one: metres to the side for each metre of way.
+const MOST_BEND: f64 = 0.02;
 /// A control point nearer to the end of its piece than this makes way for it, metres: half of what lies between two.
 const NEAREST_M: f64 = 1.5;
 /// Least cosine of the angle between two crossings of one line.
@@ -48,6 +53,8 @@ pub(crate) struct Crossing {
     pub(crate) direction: Vector2<f64>,
     /// The cell on the other side.
     pub(crate) beyond: CellId,
+    /// Category of the line.
+    pub(crate) category: Category,
 }
 
 /// A piece of a line, as it was fused.
@@ -115,7 +122,8 @@ fn cut_lane(cell: CellId, anchor: &Anchor, lane: &FusedLane, pieces: &mut Vec<Pi
             let direction = curve.derivative(parameter).xy().try_normalize(1e-9).unwrap_or_default();
             let next = CellId::containing(&anchor.wgs84_from_enu(&line[beyond]));
             let place = anchor.wgs84_from_enu(&position);
-            found.extend(next.map(|beyond| Crossing { piece: name, end, place, direction, beyond }));
+            let category = lane.category;
+            found.extend(next.map(|beyond| Crossing { piece: name, end, place, direction, beyond, category }));
         }
         if points.len() >= 2 {
             part += 1;
@@ -198,11 +206,8 @@ pub(crate) fn join<'a>(
     };
     let joined = pieces.into_iter().map(|mut piece| {
         let (begins_at, ends_at) = (join_of(piece.name, End::First), join_of(piece.name, End::Last));
-        for (end, join) in [(End::First, begins_at), (End::Last, ends_at)] {
-            if let Some(join) = join {
-                move_end(&mut piece.points, end, anchor.enu_from_wgs84(&join.place));
-            }
-        }
+        let to = [begins_at, ends_at].map(|join| join.map(|join| anchor.enu_from_wgs84(&join.place)));
+        move_ends(&mut piece.points, to);
         JoinedPiece { piece, begins_at, ends_at }
     });
     joined.collect()
@@ -222,62 +227,59 @@ fn joins<'a>(
     for neighbour in neighbours {
         let there = crossings_of(neighbour).unwrap_or_default();
         let ours: Vec<usize> = (0..joins.len()).filter(|index| joins[*index].0.beyond == neighbour).collect();
-        let theirs: Vec<&Crossing> = there.iter().filter(|crossing| crossing.beyond == cell).collect();
+        let theirs: Vec<Crossing> = there.iter().filter(|crossing| crossing.beyond == cell).copied().collect();
         let here: Vec<Crossing> = ours.iter().map(|index| joins[*index].0).collect();
-        for (our, their) in pairs(&here, &theirs) {
-            let join = &mut joins[ours[our]].1;
-            join.continues_in = Some((neighbour, their.piece));
-            if neighbour < cell {
-                join.place = their.place;
-            }
+        // Both cells do the same sums.
+        let is_first = cell < neighbour;
+        let (first, second) = if is_first { (&here, &theirs) } else { (&theirs, &here) };
+        for (one, other) in matching::pairs(&cell.min(neighbour).anchor(), first, second) {
+            let (our, their) = if is_first { (one, other) } else { (other, one) };
+            joins[ours[our]].1 = Join {
+                place: half_way(&first[one].place, &second[other].place),
+                continues_in: Some((neighbour, theirs[their].piece)),
+            };
         }
     }
     joins
 }
 
-/// Crossings of one line, seen from both sides: the nearest two first, each in one pair at most. The same pairs whichever
-/// side asks.
-fn pairs<'a>(ours: &[Crossing], theirs: &[&'a Crossing]) -> Vec<(usize, &'a Crossing)> {
-    let mut candidates = Vec::new();
-    for (our, here) in ours.iter().enumerate() {
-        for (their, there) in theirs.iter().enumerate() {
-            let apart_m = nalgebra::distance(&ecef_from_wgs84(&here.place), &ecef_from_wgs84(&there.place));
-            if apart_m <= MOST_APART_M && here.direction.dot(&there.direction).abs() >= LEAST_COS {
-                let names = [(here.piece, here.end), (there.piece, there.end)];
-                let names = if names[0] <= names[1] { names } else { [names[1], names[0]] };
-                candidates.push((apart_m, names, our, their));
-            }
-        }
+/// The place half way between two that are near each other.
+fn half_way(one: &Wgs84, other: &Wgs84) -> Wgs84 {
+    let middle = |one: f64, other: f64| 0.5 * (one + other);
+    Wgs84 {
+        latitude_deg: middle(one.latitude_deg, other.latitude_deg),
+        longitude_deg: middle(one.longitude_deg, other.longitude_deg),
+        height_m: middle(one.height_m, other.height_m),
     }
-    candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    let (mut taken_ours, mut taken_theirs) = (vec![false; ours.len()], vec![false; theirs.len()]);
-    let mut pairs = Vec::new();
-    for (_, _, our, their) in candidates {
-        if !taken_ours[our] && !taken_theirs[their] {
-            (taken_ours[our], taken_theirs[their]) = (true, true);
-            pairs.push((our, theirs[their]));
-        }
-    }
-    pairs
 }
 
-/// Moves an end of a piece to a place, and what lies before it by less and less.
-fn move_end(points: &mut [FusedPoint], end: End, place: Point3<f64>) {
+/// Moves the ends of a piece to their places, and what lies before them by less and less.
+fn move_ends(points: &mut [FusedPoint], to: [Option<Point3<f64>>; 2]) {
     let last = points.len() - 1;
-    let at = |step: usize| if end == End::First { step } else { last - step };
-    let offset: Vector3<f64> = place - points[at(0)].position;
-    if offset.norm() == 0.0 {
-        return;
+    let mut way_m = vec![0.0; points.len()];
+    for step in 1..=last {
+        way_m[step] = way_m[step - 1] + nalgebra::distance(&points[step - 1].position, &points[step].position);
     }
-    let (mut way_m, mut before) = (0.0, points[at(0)].position);
-    // The other end may lie on a border of its own: it stays.
-    for step in 0..last {
-        let point = &mut points[at(step)];
-        way_m += nalgebra::distance(&before, &point.position);
-        before = point.position;
-        point.position += offset * (1.0 - way_m / TAPER_M).max(0.0);
+    let length_m = way_m[last];
+    let moved =
+        [(0, to[0]), (last, to[1])].map(|(end, to)| to.map_or_else(Vector3::zeros, |to| to - points[end].position));
+    // An end on a border does not follow the other one; an end within the cell does.
+    let most_m = if to[0].is_some() && to[1].is_some() { length_m } else { f64::INFINITY };
+    let share = |moved: &Vector3<f64>, from_end_m: f64| {
+        let taper_m = (moved.norm() / MOST_BEND).max(TAPER_M).min(most_m).max(f64::MIN_POSITIVE);
+        (1.0 - from_end_m / taper_m).max(0.0)
+    };
+    for (point, way_m) in points.iter_mut().zip(way_m) {
+        let by = moved[0] * share(&moved[0], way_m) + moved[1] * share(&moved[1], length_m - way_m);
+        point.position += by;
+        point.lateral_sigma_m = point.lateral_sigma_m.hypot(by.xy().norm());
+        point.height_sigma_m = point.height_sigma_m.hypot(by.z);
     }
-    points[at(0)].position = place;
+    for (end, to) in [(0, to[0]), (last, to[1])] {
+        if let Some(to) = to {
+            points[end].position = to;
+        }
+    }
 }
 
 /// Whether a neighbour must join its pieces anew: a crossing into it came, went, or moved by more than a millimetre.
@@ -289,104 +291,7 @@ pub(crate) fn differ(before: &[Crossing], after: &[Crossing], neighbour: CellId)
     let (before, after) = (into(before), into(after));
     let same = |(a, b): (&Crossing, &Crossing)| {
         let apart_m = nalgebra::distance(&ecef_from_wgs84(&a.place), &ecef_from_wgs84(&b.place));
-        (a.piece, a.end) == (b.piece, b.end) && apart_m <= SAME_M
+        (a.piece, a.end, a.category) == (b.piece, b.end, b.category) && apart_m <= SAME_M
     };
     before.len() != after.len() || !before.iter().zip(&after).all(same)
-}
-
-#[cfg(test)]
-mod tests {
-    use lanemap_core::{LaneId, fleet::DriveId};
-
-    use super::*;
-
-    /// Two cells side by side in Munich.
-    fn cells() -> (CellId, CellId) {
-        (CellId::new(8_718, 5_685).unwrap(), CellId::new(8_719, 5_685).unwrap())
-    }
-
-    fn id(drive: u64) -> FusedLaneId {
-        FusedLaneId { started: TimestampNs(1), drive: DriveId(drive), lane: LaneId(4), piece: 0, stretch: 0 }
-    }
-
-    /// A line to the east over the border of both cells, as the cell sees it, `aside_m` to the north.
-    fn line(cell: CellId, drive: u64, aside_m: f64) -> FusedLane {
-        let (here, anchor) = (cells().0.anchor(), cell.anchor());
-        let points = (0..40).map(|i| {
-            let place = here.wgs84_from_enu(&Point3::new(760.0 + 3.0 * f64::from(i), 20.0 + aside_m, 500.0));
-            FusedPoint {
-                position: anchor.enu_from_wgs84(&place),
-                lateral_sigma_m: 0.1,
-                height_sigma_m: 0.2,
-                drives: 2,
-                existence: 0.9,
-                confirmed: TimestampNs(2),
-            }
-        });
-        FusedLane {
-            id: id(drive),
-            category: Category::WhiteSolid,
-            category_posterior: vec![],
-            points: points.collect(),
-            drives: 2,
-            observations: 9,
-            first_seen: TimestampNs(1),
-            last_seen: TimestampNs(2),
-        }
-    }
-
-    fn joined_both(here: &[FusedLane], there: &[FusedLane]) -> (Vec<JoinedPiece>, Vec<JoinedPiece>) {
-        let (a, b) = cells();
-        let ((pieces_a, crossings_a), (pieces_b, crossings_b)) = (cut(a, here), cut(b, there));
-        let joined_a = join(a, pieces_a, &crossings_a, |cell| (cell == b).then_some(crossings_b.as_slice()));
-        let joined_b = join(b, pieces_b, &crossings_b, |cell| (cell == a).then_some(crossings_a.as_slice()));
-        (joined_a, joined_b)
-    }
-
-    #[test]
-    fn both_pieces_of_a_line_name_each_other_and_share_the_owners_border_point() {
-        let (a, b) = cells();
-        let (here, there) = joined_both(&[line(a, 1, 0.0)], &[line(b, 1, 0.2)]);
-        let (leaves, comes) = (here[0].ends_at.unwrap(), there[0].begins_at.unwrap());
-        assert_eq!(leaves.place, comes.place);
-        assert_eq!(leaves.continues_in, Some((b, there[0].piece.name)));
-        assert_eq!(comes.continues_in, Some((a, here[0].piece.name)));
-        assert_eq!((here[0].begins_at, there[0].ends_at), (None, None));
-        let end = b.anchor().wgs84_from_enu(&there[0].piece.points[0].position);
-        assert!((end.latitude_deg - comes.place.latitude_deg).abs() < 1e-12);
-        // The owner's piece stays, the other bends to meet it and has its own course again 24 m on.
-        let height = |piece: &JoinedPiece, index: usize| {
-            cells().0.anchor().enu_from_wgs84(&b.anchor().wgs84_from_enu(&piece.piece.points[index].position)).y
-        };
-        assert!((height(&there[0], 0) - 20.0).abs() < 1e-6 && (height(&there[0], 12) - 20.2).abs() < 1e-3);
-    }
-
-    #[test]
-    fn lines_that_meet_too_far_apart_do_not_continue_each_other() {
-        let (a, b) = cells();
-        let (here, there) = joined_both(&[line(a, 1, 0.0)], &[line(b, 1, 0.6)]);
-        assert_eq!((here[0].ends_at.unwrap().continues_in, there[0].begins_at.unwrap().continues_in), (None, None));
-    }
-
-    #[test]
-    fn of_two_lines_side_by_side_each_continues_in_its_own() {
-        let (a, b) = cells();
-        let (here, there) = joined_both(&[line(a, 1, 0.0), line(a, 2, 0.3)], &[line(b, 3, 0.1), line(b, 4, 0.4)]);
-        let goes_on = |piece: &JoinedPiece| piece.ends_at.unwrap().continues_in.unwrap().1.lane.drive.0;
-        assert_eq!(here.iter().map(goes_on).collect::<Vec<_>>(), [3, 4]);
-        let comes_from = |piece: &JoinedPiece| piece.begins_at.unwrap().continues_in.unwrap().1.lane.drive.0;
-        assert_eq!(there.iter().map(comes_from).collect::<Vec<_>>(), [1, 2]);
-    }
-
-    #[test]
-    fn a_piece_ends_on_the_border_and_no_chord_of_it_is_short() {
-        let (a, _) = cells();
-        let (pieces, crossings) = cut(a, &[line(a, 1, 0.0)]);
-        let east = a.bounds().east;
-        assert!((crossings[0].place.longitude_deg - east).abs() < 1e-9 && crossings[0].place.longitude_deg < east);
-        for pair in pieces[0].points.windows(2) {
-            let chord_m = nalgebra::distance(&pair[0].position, &pair[1].position);
-            assert!((1.5..=4.6).contains(&chord_m), "{chord_m}");
-        }
-    }
 }

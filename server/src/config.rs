@@ -143,7 +143,7 @@ pub struct ServerConfig {
     pub max_cached_map_bytes: usize,
     /// Threads that fuse the shared map, 1 to 64.
     pub fuse_threads: usize,
-    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once.
+    /// Least time from the start of one fusion of a cell to that of the next, milliseconds; a cell that was quiet is fused at once.
     pub fuse_interval_ms: u64,
     /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work.
     pub fuse_cpu_share: f64,

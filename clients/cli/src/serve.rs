@@ -217,7 +217,7 @@ pub struct ServeArgs {
     /// Threads that fuse the shared map, 1 to 64 [env: LANEMAP_FUSE_THREADS] [default: 1]
     #[arg(long, value_name = "N")]
     fuse_threads: Option<usize>,
-    /// Least time between two fusions of one cell, milliseconds; a cell that was quiet is fused at once
+    /// Least time from the start of one fusion of a cell to that of the next, milliseconds; a cell that was quiet is fused at once
     /// [env: LANEMAP_FUSE_INTERVAL_MS] [default: 500]
     #[arg(long, value_name = "MS")]
     fuse_interval_ms: Option<u64>,

@@ -1,8 +1,8 @@
 //! What waits to be done: drives to be cut into contributions, and cells to be fused.
 //!
 //! Tasks come out in the order in which they became due, so that no drive and no cell waits for ever behind a busy one. A
-//! task is due at once, and again no sooner than an interval after it was done last: a change after a time of quiet is
-//! seen at once, and a stream of changes costs no more than one fusion in each interval.
+//! task is due at once, and again no sooner than an interval after it was begun last: a change after a time of quiet is
+//! seen at once, and a stream of changes costs no more than one fusion in each interval, however long that takes.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -51,8 +51,9 @@ pub(super) struct Queue {
     /// When each task in `due` is due.
     waiting: BTreeMap<Task, Instant>,
     offers: HashMap<SessionId, Offer>,
-    in_work: BTreeSet<Task>,
-    /// When tasks were done last, those of the last interval.
+    /// When each task in work was begun.
+    in_work: BTreeMap<Task, Instant>,
+    /// When tasks that are done were begun last, those of the last interval.
     done: HashMap<Task, Instant>,
     /// How much of each session has been contributed; as many as the registry lets there be.
     contributed: HashMap<SessionId, Contributed>,
@@ -88,7 +89,7 @@ impl Queue {
             due: BTreeSet::new(),
             waiting: BTreeMap::new(),
             offers: HashMap::new(),
-            in_work: BTreeSet::new(),
+            in_work: BTreeMap::new(),
             done: HashMap::new(),
             contributed: HashMap::new(),
         }
@@ -126,7 +127,7 @@ impl Queue {
         if self.waiting.contains_key(&task) {
             return;
         }
-        let again = self.done.get(&task).map(|done| *done + task.interval(self.interval));
+        let again = self.done.get(&task).map(|begun| *begun + task.interval(self.interval));
         let at = again.map_or(now, |again| again.max(now));
         self.waiting.insert(task, at);
         self.due.insert((at, task));
@@ -134,7 +135,7 @@ impl Queue {
 
     /// The task that became due first; or when the next one will be, `None` where there is none.
     pub(super) fn take(&mut self, now: Instant, wanted: Wanted) -> Result<Taken, Option<Instant>> {
-        let is_free = |task: &Task| task.same_drive().iter().all(|task| !self.in_work.contains(task));
+        let is_free = |task: &Task| task.same_drive().iter().all(|task| !self.in_work.contains_key(task));
         let is_wanted = |task: &Task| wanted == Wanted::All || matches!(task, Task::Contribute(_));
         let first = self.due.iter().find(|(_, task)| is_free(task) && is_wanted(task)).copied();
         let Some((at, task)) = first else { return Err(None) };
@@ -148,7 +149,7 @@ impl Queue {
             Task::Fuse(cell) => Some(Taken::Fuse(cell)),
         };
         let Some(taken) = taken else { return self.take(now, wanted) };
-        self.in_work.insert(task);
+        self.in_work.insert(task, now);
         Ok(taken)
     }
 
@@ -160,12 +161,12 @@ impl Queue {
 
     /// A task that was taken has been done.
     pub(super) fn finish(&mut self, task: Task, now: Instant) {
-        self.in_work.remove(&task);
+        let begun = self.in_work.remove(&task).unwrap_or(now);
         if self.done.len() >= MOST_DONE {
             let interval = self.interval;
-            self.done.retain(|task, done| *done + task.interval(interval) > now);
+            self.done.retain(|task, begun| *begun + task.interval(interval) > now);
         }
-        self.done.insert(task, now);
+        self.done.insert(task, begun);
     }
 
     /// A task that was taken could not be done: it comes again after a pause.
@@ -201,7 +202,7 @@ impl Queue {
         for task in tasks {
             self.remove(task);
         }
-        tasks.iter().all(|task| !self.in_work.contains(task))
+        tasks.iter().all(|task| !self.in_work.contains_key(task))
     }
 
     /// Forgets a session; gives what it had contributed.
@@ -211,17 +212,17 @@ impl Queue {
 
     pub(super) fn is_dirty(&self, cell: CellId) -> bool {
         let task = Task::Fuse(cell);
-        self.waiting.contains_key(&task) || self.in_work.contains(&task)
+        self.waiting.contains_key(&task) || self.in_work.contains_key(&task)
     }
 
     pub(super) fn dirty_cells(&self) -> BTreeSet<CellId> {
-        let tasks = self.waiting.keys().chain(&self.in_work);
+        let tasks = self.waiting.keys().chain(self.in_work.keys());
         tasks.filter_map(|task| if let Task::Fuse(cell) = task { Some(*cell) } else { None }).collect()
     }
 
     /// Drives whose offers are not in the store yet, or that are sought.
     pub(super) fn waiting_offers(&self) -> usize {
-        let in_work = self.in_work.iter().filter(|task| !matches!(task, Task::Fuse(_))).count();
+        let in_work = self.in_work.keys().filter(|task| !matches!(task, Task::Fuse(_))).count();
         let sought = self.waiting.keys().filter(|task| matches!(task, Task::Locate(_))).count();
         self.offers.len() + sought + in_work
     }
@@ -277,6 +278,12 @@ mod tests {
         queue.touch_cell(cell(1), now);
         assert!(matches!(queue.take(now, Wanted::All), Err(Some(at)) if at == now + INTERVAL));
         assert_eq!(taken_cell(&mut queue, now + INTERVAL), Some(cell(1)));
+        // What it takes is part of the interval.
+        queue.finish(Task::Fuse(cell(1)), now + INTERVAL.mul_f64(1.8));
+        queue.touch_cell(cell(1), now + INTERVAL.mul_f64(1.8));
+        assert!(
+            matches!(queue.take(now + INTERVAL.mul_f64(1.9), Wanted::All), Err(Some(at)) if at == now + 2 * INTERVAL)
+        );
     }
 
     #[test]

@@ -12,6 +12,9 @@
 //! `w`. It moved if that is large over a stretch; the stretch goes on, as far as the same split still tells, to where the
 //! line leaves its old course. The witnesses since then become witnesses of the line beside it, or of one of their own, which came; the old one went.
 //!
+//! Where a line runs already that passes have besides the old one, nothing moved: drives that see the two as one are taken for
+//! witnesses of either.
+//!
 //! Not guaranteed: moves by less than [`LEAST_MOVE_M`], which drives hardly tell from their own errors.
 
 use std::{collections::BTreeMap, ops::Range};
@@ -78,7 +81,9 @@ impl Fusion<'_> {
     pub(super) fn part_moved(&mut self, pieces: &mut Pieces) {
         let found = (0..self.lines.lines.len()).map(|old| {
             let beside = beside(&self.lines, old);
-            (old, moves(&offsets(&self.lines, old, &beside)), beside)
+            let mut moves = moves(&offsets(&self.lines, old, &beside));
+            moves.retain(|moved| !is_onto_its_neighbour(&self.lines, old, moved));
+            (old, moves, beside)
         });
         for (old, moves, beside) in found.collect::<Vec<_>>() {
             for moved in moves {
@@ -204,6 +209,29 @@ fn are_two(a: &Line, b: &Line, knots: &[(usize, usize)]) -> bool {
         either += of_b.len();
     }
     both as f64 > MOST_WITH_BOTH * either as f64
+}
+
+/// Whether a stretch seems to have moved to where a line runs that passes have besides it: some take the one for the other.
+fn is_onto_its_neighbour(lines: &Lines, old: usize, moved: &Move) -> bool {
+    let line = &lines.lines[old];
+    let lies_on_one = |(knot, left_m): (usize, &f64)| {
+        let tangent = line.tangent(knot);
+        let normal = normal_of(&tangent);
+        let place = line.points[knot];
+        let mut found = false;
+        lines.for_each_knot_near(&place, BESIDE_M.hypot(SAME_KNOT_M), |other, at, there| {
+            let offset = there - place;
+            let is_there = offset.dot(&tangent).abs() <= SAME_KNOT_M
+                && (offset.xy().dot(&normal) - left_m).abs() <= LEAST_MOVE_M
+                && offset.z.abs() < 3.0;
+            if !found && other != old && is_there {
+                found = are_two(line, &lines.lines[other], &[(knot, at)]);
+            }
+        });
+        found
+    };
+    let onto = moved.knots.clone().zip(&moved.left_m).filter(|pair| lies_on_one(*pair)).count();
+    2 * onto > moved.knots.len()
 }
 
 /// Gives a line witnesses of a place on it or beyond its ends.
@@ -385,7 +413,10 @@ fn median(values: &mut [f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Point3;
+
     use super::*;
+    use crate::{fleet::DriveId, frame::TimestampNs, lane_map::LaneId};
 
     fn offsets(of: &[f64]) -> Vec<(usize, f64)> {
         of.iter().enumerate().map(|(pass, offset)| (pass + 1, *offset)).collect()
@@ -402,5 +433,41 @@ mod tests {
     fn drives_that_waver_or_one_that_is_off_are_no_move() {
         assert!(step(&offsets(&[0.2, -0.2, 0.25, -0.15, 0.1, -0.2, 0.3, 0.2])).is_none());
         assert!(step(&offsets(&[0.0, 0.05, -0.04, 0.02, -0.01, 0.03, 0.6])).is_none());
+    }
+
+    /// A line of ten knots to the east that some passes have.
+    fn line(number: u64, north_m: f64, passes: Range<usize>) -> Line {
+        let id = FusedLaneId { started: TimestampNs(0), drive: DriveId(number), lane: LaneId(1), piece: 0, stretch: 0 };
+        let mut line = Line::new(id);
+        for knot in 0..10_i32 {
+            let place = Point3::new(3.0 * f64::from(knot), north_m, 0.0);
+            let witness = |pass| Witness {
+                drive: pass,
+                pass,
+                lane: 0,
+                parameter: f64::from(knot),
+                map: place,
+                arc_m: place.x,
+                shared: place,
+                lateral_variance_m2: 0.01,
+                height_variance_m2: 0.01,
+                share: 1.0,
+            };
+            line.push(place, Knot { witnesses: passes.clone().map(witness).collect(), ..Knot::default() });
+        }
+        line
+    }
+
+    #[test]
+    fn a_line_does_not_move_onto_one_that_passes_have_besides_it() {
+        let moved = Move { knots: 2..8, since: 6, left_m: vec![0.5; 6] };
+        let beside = |passes| {
+            let mut lines = Lines::default();
+            lines.lines = vec![line(1, 0.0, 0..6), line(2, 0.6, passes)];
+            lines.index();
+            is_onto_its_neighbour(&lines, 0, &moved)
+        };
+        assert!(beside(3..6), "some have both");
+        assert!(!beside(6..9), "none has both: it is the same paint anew");
     }
 }

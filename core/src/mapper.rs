@@ -421,12 +421,6 @@ impl Mapper {
         LaneMap { lanes: shown.filter_map(|lane| local_map::map_lane(lane, &self.params)).collect() }
     }
 
-    /// Whether [`Mapper::finished_lane_map`] may be another map than [`Mapper::lane_map`].
-    #[must_use]
-    pub fn cleans_up(&self) -> bool {
-        self.params.landmark.clean_up.is_some()
-    }
-
     /// The map of a drive that is over: [`Mapper::lane_map`] after the preset's [`clean_up`], where it has one.
     #[must_use]
     pub fn finished_lane_map(&self) -> LaneMap {

@@ -66,7 +66,7 @@ struct SessionList {
 struct Entry {
     id: String,
     state: SessionState,
-    /// Grows with every frame; the same version has the same map.
+    /// Grows with every frame, and with the clean-up of a map whose drive is over; the same version has the same map.
     version: u64,
     lanes: usize,
     frames: u64,
@@ -210,7 +210,7 @@ fn entry(
         state: map.state,
         version: map.version.0,
         lanes: map.lanes,
-        frames: map.version.0,
+        frames: map.frames(),
         georeferenced: map.georeference.is_some(),
         placement: match &aligned_to_map {
             Some(aligned) if aligned.state != "aligned" => "own frame",

@@ -104,7 +104,7 @@ fn point(drive: &SessionSummary) -> Vehicle {
         properties: Motion {
             heading_deg: at.heading_deg,
             at: rfc3339(drive.last_time),
-            frames: drive.version.0,
+            frames: drive.frames(),
             lanes: drive.lanes,
         },
     }

@@ -14,6 +14,7 @@ use thiserror::Error;
 
 use super::{
     MapVersion, PublishedMap, SessionId, SessionRecord, SessionSetup, SessionState, SessionSummary,
+    published::is_cleaned_up,
     recent::{REMEMBERED, RecentFrames, Recollection},
     way::Way,
 };
@@ -308,7 +309,7 @@ impl Drive {
 
     /// What readers are shown.
     pub(crate) fn published(&mut self, session: SessionId, state: SessionState) -> PublishedMap {
-        let is_cleaned_up = state == SessionState::Closed && self.mapper.cleans_up();
+        let is_cleaned_up = is_cleaned_up(self.mapper.params().preset, state);
         let version = MapVersion(self.progress.mapped + u64::from(is_cleaned_up));
         let summary = SessionSummary {
             session,

@@ -18,7 +18,7 @@ use std::{
 
 use arc_swap::{ArcSwap, ArcSwapOption};
 use lanemap_core::{
-    ControlPoint, LaneMap, Preset, Sequence, TimestampNs,
+    ControlPoint, LaneMap, Params, Preset, Sequence, TimestampNs,
     geometry::{Pose, georeference::Georeference},
 };
 use nalgebra::Point3;
@@ -98,6 +98,19 @@ impl SessionSummary {
             georeference: None,
         }
     }
+}
+
+impl SessionSummary {
+    /// Number of frames in the map.
+    #[must_use]
+    pub fn frames(&self) -> u64 {
+        self.version.0 - u64::from(is_cleaned_up(self.preset, self.state)).min(self.version.0)
+    }
+}
+
+/// Whether the map of a drive in this state is the cleaned-up one, which has a version more than it has frames.
+pub(super) fn is_cleaned_up(preset: Preset, state: SessionState) -> bool {
+    state == SessionState::Closed && Params::preset(preset).landmark.clean_up.is_some()
 }
 
 /// The state of a drive to which no stream is open.

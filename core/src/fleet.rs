@@ -82,6 +82,7 @@ mod prepared;
 mod receivers;
 pub mod redundancy;
 mod repainted;
+pub mod settled;
 mod shown;
 mod sparse;
 pub mod trace;
@@ -94,9 +95,10 @@ pub use change::{ChangeKind, MapChange};
 pub use contribution::{Contribution, DriveId, PlacedBy, TrajectoryPoint};
 pub use correction::Correction;
 pub use fusion::{
-    FusedDrive, FusedMap, are_enough_apart, by_seniority, fold, fuse, fuse_from, fuse_onto, split_to_fold,
+    Fused, FusedDrive, FusedMap, Keep, are_enough_apart, by_seniority, fold, fuse, fuse_from, fuse_onto, split_to_fold,
 };
 pub use line::{FusedLane, FusedLaneId, FusedPoint};
 pub use params::FleetParams;
 pub use redundancy::{Visits, missed_least};
+pub use settled::{Settled, draft};
 pub use trace::Trace;

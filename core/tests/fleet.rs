@@ -5,7 +5,8 @@ mod roads;
 use lanemap_core::{
     Category,
     fleet::{
-        Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, by_seniority, fold, fuse, fuse_from, fuse_onto,
+        Base, ChangeKind, Contribution, DriveId, FleetParams, FusedMap, Keep, by_seniority, fold, fuse, fuse_from,
+        fuse_onto,
     },
 };
 use nalgebra::Vector2;
@@ -127,17 +128,17 @@ proptest! {
         let mut live: Vec<Contribution> = drives[folded..8].to_vec();
         let last = live.len() - 1;
         live[last] = stretch(&live[last], 0.0, so_far_m);
-        let (_, beginning) = fuse_from(None, &base, &by_seniority(&live), &anchor, &params, Some(kept));
-        let beginning = beginning.unwrap();
+        let before = |drive: usize| Keep { beginning_before: Some(drive), settled: false };
+        let beginning = fuse_from(None, &base, &by_seniority(&live), &anchor, &params, before(kept)).beginning.unwrap();
         prop_assert_eq!(beginning.drives(), kept);
         // The live one has grown, and another may have come.
         live[last] = drives[7].clone();
         live.extend(drives[8..8 + arrive].iter().cloned());
         let now = by_seniority(&live);
-        let (map, further) = fuse_from(Some(&beginning), &base, &now, &anchor, &params, Some(kept + 1));
-        prop_assert_eq!(&map, &fuse_onto(&base, &now, &anchor, &params));
-        let (again, _) = fuse_from(further.as_ref(), &base, &now, &anchor, &params, None);
-        prop_assert_eq!(&map, &again);
+        let fused = fuse_from(Some(&beginning), &base, &now, &anchor, &params, before(kept + 1));
+        prop_assert_eq!(&fused.map, &fuse_onto(&base, &now, &anchor, &params));
+        let again = fuse_from(fused.beginning.as_ref(), &base, &now, &anchor, &params, Keep::default());
+        prop_assert_eq!(&fused.map, &again.map);
     }
 }
 

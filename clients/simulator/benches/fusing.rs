@@ -10,8 +10,8 @@ use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use lanemap_core::{
     Mapper, Params, Preset,
     fleet::{
-        Base, CellId, Contribution, DriveId, FleetParams, Trace, by_seniority, cell::cut, fold, fuse, fuse_from,
-        split_to_fold,
+        Base, CellId, Contribution, DriveId, FleetParams, Keep, Trace, by_seniority, cell::cut, draft, fold, fuse,
+        fuse_from, split_to_fold,
     },
     geometry::{Pose, georeference::Georeference},
 };
@@ -70,9 +70,18 @@ fn fusing(criterion: &mut Criterion) {
             base = fold(&base, oldest, &anchor, &params);
             rest = younger;
         }
-        let (_, beginning) = fuse_from(None, &base, rest, &anchor, &params, Some(rest.len() - 1));
+        let keep = Keep { beginning_before: Some(rest.len() - 1), settled: false };
+        let beginning = fuse_from(None, &base, rest, &anchor, &params, keep).beginning;
         group.bench_function(BenchmarkId::new("one_drive_grown", name), |bencher| {
-            bencher.iter(|| fuse_from(beginning.as_ref(), black_box(&base), rest, &anchor, &params, None));
+            let go_on = || fuse_from(beginning.as_ref(), black_box(&base), rest, &anchor, &params, Keep::default());
+            bencher.iter(go_on);
+        });
+        // The same until all are solved together: on the map of the others as it stands.
+        let (live, others) = rest.split_last().expect("the scenario has drives");
+        let keep = Keep { beginning_before: None, settled: true };
+        let settled = fuse_from(None, &base, others, &anchor, &params, keep).settled.expect("it was asked for");
+        group.bench_function(BenchmarkId::new("one_drive_drafted", name), |bencher| {
+            bencher.iter(|| draft(black_box(&settled), &[live], &anchor, &params));
         });
     }
     group.finish();

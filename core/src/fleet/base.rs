@@ -11,8 +11,10 @@ use super::{
     contribution::PlacedBy,
     correction::{Correction, CorrectionKnot},
     fusion::Fusion,
+    history::Belief,
     line::{BASE, FusedLaneId, Knot, KnotRecord, Line, LineRecord, Lines, Witness},
     prepared::{DriftSigma, Restraints, SharedFix, normal_of},
+    repainted::Paint,
     ways::Ways,
 };
 
@@ -29,6 +31,8 @@ pub struct Base {
     lines: Vec<BaseLine>,
     /// Where its drives went.
     ways: Ways,
+    /// Not to be shifted at all.
+    pub(super) is_held: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -83,6 +87,16 @@ impl Base {
         lines
     }
 
+    /// Number of the knots of its lines.
+    pub(super) fn knots(&self) -> usize {
+        self.lines.iter().map(|line| line.knots.len()).sum()
+    }
+
+    /// About how much memory it takes, bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.knots() * size_of::<BaseKnot>() + self.lines.len() * size_of::<BaseLine>() + self.ways.bytes()
+    }
+
     /// Where its drives went.
     pub(super) fn ways(&self) -> &Ways {
         &self.ways
@@ -92,17 +106,22 @@ impl Base {
     pub(super) fn restraints(&self) -> Restraints {
         /// Of the corners to each other: the base is stiff.
         const STIFF_M: f64 = 0.01;
+        /// The same where it is held, and of its bias.
+        const HELD_M: f64 = 1e-4;
+        let stiff_m = if self.is_held { HELD_M } else { STIFF_M };
         let places = || self.lines.iter().flat_map(|line| line.knots.iter().map(|knot| knot.place));
         let low = places().fold(Point3::from([f64::INFINITY; 3]), |low, place| low.inf(&place));
         let high = places().fold(Point3::from([f64::NEG_INFINITY; 3]), |high, place| high.sup(&place));
         let corners = [(low.x, low.y), (high.x, low.y), (low.x, high.y), (high.x, high.y)];
         let fix = |(x, y)| {
             let place = Point3::new(x, y, 0.0);
-            SharedFix { arc_m: 0.0, map: place, shared: place, sigma_m: [STIFF_M; 2] }
+            SharedFix { arc_m: 0.0, map: place, shared: place, sigma_m: [stiff_m; 2] }
         };
         let fixes = if self.lines.is_empty() { Vec::new() } else { corners.into_iter().map(fix).collect() };
         // Without drives there are no fixes, and no bias is asked for.
-        let bias_sigma_m = self.gnss_information.map(|information| information.max(1e-9).powf(-0.5));
+        let bias_sigma_m = self
+            .gnss_information
+            .map(|information| if self.is_held { HELD_M } else { information.max(1e-9).powf(-0.5) });
         // It has no odometry: nothing asks for its drift.
         let drift_sigma = DriftSigma { scale: 1.0, turn_rad_per_m: 1.0 };
         Restraints {
@@ -126,18 +145,27 @@ impl Correction {
 }
 
 impl Fusion<'_> {
-    /// Folds the drives into the base.
-    pub(super) fn into_base(self, before: &Base) -> Base {
-        let (beliefs, paints) = (self.beliefs(), self.paints());
+    /// The drives folded into the base.
+    pub(super) fn folded_base(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>]) -> Base {
+        self.new_base(beliefs, paints, SHAPE_SIGMA_M)
+    }
+
+    /// The same, to be held as it is until all are fused again.
+    pub(super) fn held_base(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>]) -> Base {
+        Base { is_held: true, ..self.new_base(beliefs, paints, 0.0) }
+    }
+
+    fn new_base(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>], shape_sigma_m: f64) -> Base {
+        let before = self.base;
         let mut lines = Vec::with_capacity(self.lines.lines.len());
-        for (index, ((line, beliefs), paints)) in self.lines.lines.iter().zip(&beliefs).zip(&paints).enumerate() {
+        for (index, ((line, beliefs), paints)) in self.lines.lines.iter().zip(beliefs).zip(paints).enumerate() {
             let knots = (0..line.points.len()).map(|knot| {
                 let normal = normal_of(&line.tangent(knot));
                 let mean = line.mean_offset(knot, &normal, self.params);
                 BaseKnot {
                     place: line.points[knot],
-                    lateral_variance_m2: 1.0 / mean.across_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
-                    height_variance_m2: 1.0 / mean.height_information.max(1e-6) + SHAPE_SIGMA_M.powi(2),
+                    lateral_variance_m2: 1.0 / mean.across_information.max(1e-6) + shape_sigma_m.powi(2),
+                    height_variance_m2: 1.0 / mean.height_information.max(1e-6) + shape_sigma_m.powi(2),
                     record: KnotRecord {
                         drives: line.knots[knot].drives(),
                         belief: Some(beliefs[knot]),
@@ -156,7 +184,8 @@ impl Fusion<'_> {
         for (drive, _, pass) in self.passes() {
             ways.add(pass.way, &self.corrections[drive]);
         }
-        let mut base = Base { drives: before.drives, gnss_information: before.gnss_information, lines, ways };
+        let mut base =
+            Base { drives: before.drives, gnss_information: before.gnss_information, lines, ways, is_held: false };
         for (drive, _) in self.drives.iter().zip(&self.placed).filter(|(_, placed)| **placed) {
             base.drives += 1;
             for (sum, sigma_m) in base.gnss_information.iter_mut().zip(drive.restraints.bias_sigma_m) {

@@ -31,6 +31,7 @@ use super::{
     params::FleetParams,
     prepared::{PreparedDrive, PreparedPass, Restraints, normal_of},
     receivers::learned_shape_share,
+    settled::Settled,
     ways::Ways,
 };
 pub(super) use laying::Laying;
@@ -111,17 +112,36 @@ pub fn fold(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &Fle
     let mut fusion = Fusion::new(base, &prepared, params);
     fusion.place_all(Laying::default(), None);
     fusion.align_and_draw();
-    fusion.into_base(base)
+    fusion.folded_base(&fusion.beliefs(), &fusion.paints())
 }
 
 /// Fuses the drives that are kept apart onto a base.
 #[must_use]
 pub fn fuse_onto(base: &Base, drives: &[&Contribution], anchor: &Anchor, params: &FleetParams) -> FusedMap {
-    fuse_from(None, base, drives, anchor, params, None).0
+    fuse_from(None, base, drives, anchor, params, Keep::default()).map
 }
 
-/// As [`fuse_onto`], to the bit, going on from a beginning of the same base and the same first drives, if there is one. `keep` asks for
-/// the beginning before that drive; there is none before the beginning's own drives.
+/// What is to be kept of a fusion beside its map.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Keep {
+    /// The beginning before this drive; there is none before the drives of the beginning that a fusion goes on from.
+    pub beginning_before: Option<usize>,
+    /// What live drives may be laid on.
+    pub settled: bool,
+}
+
+/// A map, and what was kept of its fusion.
+#[derive(Clone, Debug)]
+pub struct Fused {
+    /// The map.
+    pub map: FusedMap,
+    /// What became of its first drives, as asked for.
+    pub beginning: Option<Beginning>,
+    /// What live drives may be laid on, as asked for.
+    pub settled: Option<Settled>,
+}
+
+/// As [`fuse_onto`], to the bit, going on from a beginning of the same base and the same first drives, if there is one.
 #[must_use]
 pub fn fuse_from(
     beginning: Option<&Beginning>,
@@ -129,8 +149,8 @@ pub fn fuse_from(
     drives: &[&Contribution],
     anchor: &Anchor,
     params: &FleetParams,
-    keep: Option<usize>,
-) -> (FusedMap, Option<Beginning>) {
+    keep: Keep,
+) -> Fused {
     let known = |drive: usize| beginning.and_then(|beginning| beginning.by_gnss(drive));
     let prepared = drives.iter().enumerate().map(|(number, contribution)| match known(number) {
         Some(by_gnss) => PreparedDrive::of(contribution, by_gnss.clone(), anchor, params),
@@ -139,16 +159,23 @@ pub fn fuse_from(
     let prepared: Vec<PreparedDrive<'_>> = prepared.collect();
     let mut fusion = Fusion::new(base, &prepared, params);
     let laying = beginning.map_or_else(Laying::default, |beginning| fusion.go_on(beginning));
-    let kept = fusion.place_all(laying, keep);
+    let beginning = fusion.place_all(laying, keep.beginning_before);
     fusion.align_and_draw();
-    (fusion.into_map(base), kept)
+    let (beliefs, paints) = (fusion.beliefs(), fusion.paints());
+    let map = fusion.map(&beliefs, &paints);
+    let settled = keep.settled.then(|| Settled {
+        base: fusion.held_base(&beliefs, &paints),
+        drives: map.drives.clone(),
+        folded_drives: map.folded_drives,
+    });
+    Fused { map, beginning, settled }
 }
 
 /// Drives while they are fused.
 pub(super) struct Fusion<'a> {
     pub(super) drives: &'a [PreparedDrive<'a>],
     pub(super) params: &'a FleetParams,
-    base: &'a Base,
+    pub(super) base: &'a Base,
     /// Of each drive, then of the base.
     pub(super) corrections: Vec<Correction>,
     restraints: Vec<Restraints>,
@@ -267,6 +294,9 @@ impl<'a> Fusion<'a> {
         let restraints: Vec<&Restraints> = self.restraints.iter().collect();
         let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
         align(&restraints, &mut self.corrections, &sightings, stations, scales, &mut self.eliminations);
+        if self.base.is_held {
+            self.corrections[self.drives.len()] = Correction::identity();
+        }
     }
 
     /// Weighs the shape that receivers tell, from the next alignment on, by how far they disagree about it.

@@ -6,12 +6,12 @@ use std::{
 };
 
 use super::{
-    base::Base,
     fusion::{FusedDrive, FusedMap, Fusion},
     history::Belief,
     line::{BASE, FusedLane, FusedLaneId, FusedPoint, LineRecord},
     params::FleetParams,
     prepared::{PreparedPass, normal_of},
+    repainted::Paint,
 };
 use crate::category::Category;
 
@@ -45,8 +45,7 @@ impl Fusion<'_> {
     }
 
     /// The map as it is shown.
-    pub(super) fn into_map(self, base: &Base) -> FusedMap {
-        let beliefs = self.beliefs();
+    pub(super) fn map(&self, beliefs: &[Vec<Belief>], paints: &[Vec<Paint>]) -> FusedMap {
         let mut lanes: Vec<FusedLane> = Vec::new();
         for (index, beliefs) in beliefs.iter().enumerate() {
             let points = self.points_of(index, beliefs);
@@ -59,15 +58,16 @@ impl Fusion<'_> {
             lanes.extend(pieces.map(|(stretch, knots)| self.fused_lane(index, stretch, &points[knots], &record)));
         }
         lanes.sort_by_key(|lane| lane.id);
-        let changes = self.changes(&beliefs, &self.paints());
-        let drives = self.drives.iter().zip(&self.placed).zip(self.corrections).map(|((drive, placed), correction)| {
-            FusedDrive { drive: drive.contribution.drive, correction: placed.then_some(correction) }
-        });
+        let changes = self.changes(beliefs, paints);
+        let drives =
+            self.drives.iter().zip(&self.placed).zip(&self.corrections).map(|((drive, placed), correction)| {
+                FusedDrive { drive: drive.contribution.drive, correction: placed.then(|| correction.clone()) }
+            });
         FusedMap {
             lanes,
             changes,
             drives: drives.collect(),
-            folded_drives: u32::try_from(base.drives()).unwrap_or(u32::MAX),
+            folded_drives: u32::try_from(self.base.drives()).unwrap_or(u32::MAX),
         }
     }
 

@@ -71,6 +71,11 @@ impl Ways {
         }
     }
 
+    /// About how much memory they take, bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.squares.values().map(|points| size_of_val(points.as_slice())).sum()
+    }
+
     /// Places within a distance horizontally, and some that are a little farther.
     pub(super) fn near(&self, place: &Point3<f64>, reach_m: f64) -> impl Iterator<Item = &WayPoint> {
         let corner = |sign: f64| square_of(&Point3::new(place.x + sign * reach_m, place.y + sign * reach_m, place.z));

@@ -147,6 +147,9 @@ pub struct ServerConfig {
     pub fuse_interval_ms: u64,
     /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work.
     pub fuse_cpu_share: f64,
+    /// Kilometres of line from which on a cell is drafted while up to 8 drives are live in it, 0 to 1e6: they are laid on the map of
+    /// the others, and all are fused once the cell is quiet, or after a minute.
+    pub fuse_draft_km: f64,
     /// Drives from which a cell is fused, at least 1. Of more, what is missed least is dropped: the oldest whose ways a crowd
     /// of younger ones went as well.
     pub max_contributions_per_cell: usize,
@@ -259,6 +262,7 @@ impl Default for ServerConfig {
             fuse_threads: 1,
             fuse_interval_ms: 500,
             fuse_cpu_share: 0.5,
+            fuse_draft_km: 8.0,
             max_contributions_per_cell: 256,
             max_localization_km: 1000.0,
             cell_versions_kept_s: 3600,
@@ -381,6 +385,7 @@ impl ServerConfig {
         within("fuse_threads", self.fuse_threads as f64, 1.0, 64.0, "1 ..= 64")?;
         within("fuse_interval_ms", self.fuse_interval_ms as f64, 0.0, 3_600_000.0, "0 ..= 3600000")?;
         within("fuse_cpu_share", self.fuse_cpu_share, 0.01, 1.0, "0.01 ..= 1")?;
+        within("fuse_draft_km", self.fuse_draft_km, 0.0, 1e6, "0 ..= 1e6")?;
         within("max_contributions_per_cell", self.max_contributions_per_cell as f64, 1.0, 1e4, "1 ..= 1e4")?;
         within("max_localization_km", self.max_localization_km, 0.0, 1e6, "0 ..= 1e6")?;
         within("cell_versions_kept_s", self.cell_versions_kept_s as f64, 0.0, 1e8, "0 ..= 1e8")?;

@@ -3,7 +3,8 @@
 //! 1. A session's actor [`offers`](Fuser::offer) what its drive says each time it publishes; the newest offer counts.
 //! 2. A worker cuts the offer into [contributions](offer) per cell and puts those that changed into the store.
 //! 3. A cell whose contributions are not those that it was fused from is dirty: a worker fuses it (`lanemap_core::fleet::fuse`),
-//!    [cuts](border) its lines at the tile's border, and joins them with those of its neighbours.
+//!    [cuts](border) its lines at the tile's border, and joins them with those of its neighbours. While drives are live in a large
+//!    one, it is [drafted](drafts), and fused once it is quiet.
 //! 4. Where its [bytes](wire) differ, a new version is made durable, which gives the map its next [revision](publications),
 //!    and [swapped in](shared_map) for readers.
 //!
@@ -16,6 +17,7 @@ mod bases;
 mod beginnings;
 pub(crate) mod border;
 mod cell_record;
+mod drafts;
 pub mod events;
 pub mod follow;
 mod footprints;
@@ -57,6 +59,7 @@ use crate::{
 };
 use bases::Bases;
 use cell_record::{FORMAT, fingerprint};
+use drafts::Drafts;
 use footprints::Footprints;
 use localizing::{SearchedMap, Sought};
 use publications::Publications;
@@ -69,6 +72,8 @@ pub(crate) struct FuseSettings {
     pub(crate) threads: usize,
     pub(crate) interval: Duration,
     pub(crate) cpu_share: f64,
+    /// Length of its lines from which on a cell is drafted, metres.
+    pub(crate) draft_from_m: f64,
     pub(crate) max_contributions: usize,
     pub(crate) versions_kept: Duration,
     pub(crate) most_events: usize,
@@ -83,6 +88,7 @@ impl FuseSettings {
             threads: config.fuse_threads,
             interval: Duration::from_millis(config.fuse_interval_ms),
             cpu_share: config.fuse_cpu_share,
+            draft_from_m: 1e3 * config.fuse_draft_km,
             max_contributions: config.max_contributions_per_cell,
             versions_kept: Duration::from_secs(config.cell_versions_kept_s),
             most_events: config.max_events_per_cell,
@@ -104,6 +110,7 @@ struct Shared {
     map: SharedMap,
     queue: Mutex<Queue>,
     bases: Bases,
+    drafts: Drafts,
     footprints: Footprints,
     /// The map as drives without GNSS are sought on it.
     searched: Mutex<SearchedMap>,
@@ -166,6 +173,7 @@ impl Fuser {
             map,
             queue: Mutex::new(queue),
             bases: Bases::new(),
+            drafts: Drafts::new(settings.draft_from_m),
             footprints: Footprints::new(),
             searched: Mutex::default(),
             woken: Condvar::new(),

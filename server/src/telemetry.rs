@@ -49,6 +49,8 @@ pub const CELLS_DIRTY: &str = "lanemap_cells_dirty";
 pub const CHANGE_READERS: &str = "lanemap_change_readers";
 /// Cells that were fused.
 pub const CELLS_FUSED: &str = "lanemap_cells_fused_total";
+/// Cells that were drafted.
+pub const CELLS_DRAFTED: &str = "lanemap_cells_drafted_total";
 /// Seconds of fusing one cell.
 pub const FUSE_SECONDS: &str = "lanemap_fuse_seconds";
 /// Contributions of drives to cells that came or changed.
@@ -116,7 +118,9 @@ fn begin_at_zero() {
     for name in [FRAMES_ACKED, FRAMES_REPEATED, UPDATES_DROPPED, HANDSHAKES_FAILED, CREDENTIALS_REFUSED] {
         metrics::counter!(name).increment(0);
     }
-    for name in [ZENOH_REPEATED, ZENOH_TURNED_AWAY, ZENOH_QUERIES_TURNED_AWAY, CELLS_FUSED, CONTRIBUTIONS] {
+    for name in
+        [ZENOH_REPEATED, ZENOH_TURNED_AWAY, ZENOH_QUERIES_TURNED_AWAY, CELLS_FUSED, CELLS_DRAFTED, CONTRIBUTIONS]
+    {
         metrics::counter!(name).increment(0);
     }
     for reason in (1..).map_while(|number| RefusalReason::try_from(number).ok()) {
@@ -154,6 +158,7 @@ fn describe() {
     describe_gauge!(CELLS_DIRTY, Unit::Count, "Cells that are not fused from what drives say now");
     describe_gauge!(CHANGE_READERS, Unit::Count, "Readers that follow the map");
     describe_counter!(CELLS_FUSED, Unit::Count, "Cells that were fused");
+    describe_counter!(CELLS_DRAFTED, Unit::Count, "Drafts of cells: live drives laid on what is settled");
     describe_histogram!(FUSE_SECONDS, Unit::Seconds, "Fusing one cell");
     describe_counter!(CONTRIBUTIONS, Unit::Count, "Contributions of drives to cells that came or changed");
     describe_histogram!(CONTRIBUTE_SECONDS, Unit::Seconds, "Cutting one drive into contributions and storing them");

@@ -225,6 +225,11 @@ pub struct ServeArgs {
     /// [env: LANEMAP_FUSE_CPU_SHARE] [default: 0.5]
     #[arg(long, value_name = "SHARE")]
     fuse_cpu_share: Option<f64>,
+    /// Kilometres of line from which on a cell is drafted while up to 8 drives are live in it, 0 to 1e6: they are laid on the map of
+    /// the others, and all are fused once the cell is quiet, or after a minute
+    /// [env: LANEMAP_FUSE_DRAFT_KM] [default: 8.0]
+    #[arg(long, value_name = "KM")]
+    fuse_draft_km: Option<f64>,
     /// Drives from which a cell is fused, at least 1. Of more, what is missed least is dropped: the oldest whose ways a crowd
     /// of younger ones went as well
     /// [env: LANEMAP_MAX_CONTRIBUTIONS_PER_CELL] [default: 256]
@@ -368,6 +373,7 @@ impl ServeArgs {
             fuse_threads: self.fuse_threads,
             fuse_interval_ms: self.fuse_interval_ms,
             fuse_cpu_share: self.fuse_cpu_share,
+            fuse_draft_km: self.fuse_draft_km,
             max_contributions_per_cell: self.max_contributions_per_cell,
             max_localization_km: self.max_localization_km,
             cell_versions_kept_s: self.cell_versions_kept_s,

@@ -117,6 +117,8 @@ pub struct ConfigOverrides {
     pub fuse_interval_ms: Option<u64>,
     /// See [`ServerConfig::fuse_cpu_share`].
     pub fuse_cpu_share: Option<f64>,
+    /// See [`ServerConfig::fuse_draft_km`].
+    pub fuse_draft_km: Option<f64>,
     /// See [`ServerConfig::max_contributions_per_cell`].
     pub max_contributions_per_cell: Option<usize>,
     /// See [`ServerConfig::max_localization_km`].
@@ -216,6 +218,7 @@ impl ConfigOverrides {
         set(&mut settings.fuse_threads, self.fuse_threads);
         set(&mut settings.fuse_interval_ms, self.fuse_interval_ms);
         set(&mut settings.fuse_cpu_share, self.fuse_cpu_share);
+        set(&mut settings.fuse_draft_km, self.fuse_draft_km);
         set(&mut settings.max_contributions_per_cell, self.max_contributions_per_cell);
         set(&mut settings.max_localization_km, self.max_localization_km);
         set(&mut settings.cell_versions_kept_s, self.cell_versions_kept_s);

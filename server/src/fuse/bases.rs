@@ -6,7 +6,7 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use lanemap_core::fleet::{
-    Base, CellId, Contribution, DriveId, FleetParams, FusedMap, are_enough_apart, by_seniority, fold, split_to_fold,
+    Base, CellId, Contribution, DriveId, FleetParams, Fused, are_enough_apart, by_seniority, fold, split_to_fold,
 };
 use quick_cache::sync::Cache;
 
@@ -41,7 +41,7 @@ impl Bases {
         facts: &Facts,
         params: &FleetParams,
         read: impl Fn(SessionId) -> Result<Option<Contribution>, JournalError>,
-    ) -> Result<FusedMap, JournalError> {
+    ) -> Result<Fused, JournalError> {
         let anchor = cell.anchor();
         let mut ordered: Vec<(ContributionFact, SessionId)> =
             facts.iter().map(|(session, fact)| (*fact, *session)).collect();
@@ -78,7 +78,7 @@ impl Bases {
     }
 }
 
-fn missing(cell: CellId) -> JournalError {
+pub(super) fn missing(cell: CellId) -> JournalError {
     JournalError::Decode { what: format!("a contribution to cell {cell}"), reason: "it is not there".to_owned() }
 }
 
@@ -171,9 +171,9 @@ pub(super) mod tests {
         let bases = Bases::new();
         let whole = fuse(&drives, &cell.anchor(), &params);
         assert!(!whole.lanes.is_empty());
-        assert_eq!(bases.fuse(cell, &facts, &params, read).unwrap(), whole);
+        assert_eq!(bases.fuse(cell, &facts, &params, read).unwrap().map, whole);
         assert_eq!(reads.swap(0, Ordering::Relaxed), count);
-        assert_eq!(bases.fuse(cell, &facts, &params, read).unwrap(), whole);
+        assert_eq!(bases.fuse(cell, &facts, &params, read).unwrap().map, whole);
         assert_eq!(reads.load(Ordering::Relaxed), count - params.drives_per_fold);
     }
 }

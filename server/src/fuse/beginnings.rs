@@ -7,7 +7,7 @@ use std::{collections::VecDeque, sync::Arc};
 
 use lanemap_core::{
     TimestampNs,
-    fleet::{Base, Beginning, CellId, Contribution, DriveId, FleetParams, FusedMap, fuse_from},
+    fleet::{Base, Beginning, CellId, Contribution, DriveId, FleetParams, Fused, Keep, fuse_from},
 };
 use quick_cache::{Weighter, sync::Cache};
 
@@ -54,7 +54,7 @@ impl Beginnings {
         Self { known: Cache::with_weighter(CELLS, MOST_BYTES, ByBytes) }
     }
 
-    /// Fuses drives onto a base as `lanemap_core::fleet::fuse_onto` does. `base_print` and `facts` tell the base and the
+    /// Fuses drives onto a base as `lanemap_core::fleet::fuse_onto` does, and gives what is settled of them. `base_print` and `facts` tell the base and the
     /// drives from others.
     pub(super) fn fuse(
         &self,
@@ -62,7 +62,7 @@ impl Beginnings {
         (base_print, base): (u64, &Base),
         (facts, drives): (Vec<ContributionFact>, &[&Contribution]),
         params: &FleetParams,
-    ) -> FusedMap {
+    ) -> Fused {
         let before = self.known.get(&cell);
         let same_base = before.as_ref().filter(|known| known.base == base_print);
         // The youngest will grow, for all that is known.
@@ -76,11 +76,11 @@ impl Beginnings {
         let oldest_live = changed.iter().min().copied();
         let live_from = facts.partition_point(|fact| Some((fact.started, fact.drive)) < oldest_live);
         let is_farther = live_from > beginning.as_ref().map_or(0, |beginning| beginning.drives());
-        let keep = is_farther.then_some(live_from);
-        let (map, kept) = fuse_from(beginning.as_deref(), base, drives, &cell.anchor(), params, keep);
-        let beginning = kept.map(Arc::new).or(beginning);
+        let keep = Keep { beginning_before: is_farther.then_some(live_from), settled: true };
+        let mut fused = fuse_from(beginning.as_deref(), base, drives, &cell.anchor(), params, keep);
+        let beginning = fused.beginning.take().map(Arc::new).or(beginning);
         self.known.insert(cell, Arc::new(Known { base: base_print, facts, beginning, changed }));
-        map
+        fused
     }
 }
 
@@ -124,18 +124,18 @@ mod tests {
         for (round, live) in [7, 5, 7, 5, 7].into_iter().chain([7; RECENT]).enumerate() {
             now[live].trajectory = whole[live].trajectory[..9 + round].to_vec();
             let drives = by_seniority(&now);
-            let map = beginnings.fuse(cell, (7, &base), (facts(&now), &drives), &params);
+            let map = beginnings.fuse(cell, (7, &base), (facts(&now), &drives), &params).map;
             assert_eq!(map, fuse_onto(&base, &drives, &cell.anchor(), &params), "round {round}");
             let expected = if (1..RECENT + 3).contains(&round) { 5 } else { 7 };
             assert_eq!(kept(&beginnings), Some(expected), "round {round}");
         }
         now.push(drive(8));
         let drives = by_seniority(&now);
-        let map = beginnings.fuse(cell, (7, &base), (facts(&now), &drives), &params);
+        let map = beginnings.fuse(cell, (7, &base), (facts(&now), &drives), &params).map;
         assert_eq!(map, fuse_onto(&base, &drives, &cell.anchor(), &params));
         // Another base: nothing that was kept is used.
         let drives = by_seniority(&now[1..]);
-        let map = beginnings.fuse(cell, (8, &base), (facts(&now[1..]), &drives), &params);
+        let map = beginnings.fuse(cell, (8, &base), (facts(&now[1..]), &drives), &params).map;
         assert_eq!(map, fuse_onto(&base, &drives, &cell.anchor(), &params));
     }
 }

@@ -23,7 +23,7 @@ pub struct CellVersion(pub u64);
 pub struct CellRecord {
     /// Version of its map.
     pub version: CellVersion,
-    /// What it was fused from.
+    /// What it was fused from; `drafts::DRAFTED` where that is a draft.
     pub(crate) fingerprint: u64,
     /// When it was fused last, milliseconds since the Unix epoch.
     pub fused_at_ms: u64,

@@ -163,8 +163,14 @@ pub(super) struct Known<'a> {
 }
 
 /// What a version tells of: events that are new or differ from what is known, without revision and time; new ones without
-/// number.
-pub(super) fn told(known: &Known<'_>, fused: &FusedMap, after: &[v1::FusedLane]) -> Vec<CellEvent> {
+/// number. Of the road by what was `fused`: a draft says nothing of it.
+pub(super) fn told(known: &Known<'_>, fused: Option<&FusedMap>, after: &[v1::FusedLane]) -> Vec<CellEvent> {
+    let mut told = fused.map_or_else(Vec::new, |fused| told_of_road(known, fused));
+    told.extend(descents(known.lanes, after).into_iter().map(|descent| of_names(descent, known.lanes)));
+    told
+}
+
+fn told_of_road(known: &Known<'_>, fused: &FusedMap) -> Vec<CellEvent> {
     let is_left = |change: &MapChange| known.left.is_some_and(|left| change.noticed <= left);
     let believed = believed(known.cell, fused);
     let of_road: Vec<Remembered<'_>> =
@@ -183,7 +189,6 @@ pub(super) fn told(known: &Known<'_>, fused: &FusedMap, after: &[v1::FusedLane])
     }
     let is_new = |it: &&Believed<'_>| !is_left(it.change) && !of_road.iter().any(|old| it.is_told_by(old, &goes_on));
     told.extend(believed.iter().filter(is_new).map(|it| it.event(known, fused)));
-    told.extend(descents(known.lanes, after).into_iter().map(|descent| of_names(descent, known.lanes)));
     told
 }
 
@@ -440,7 +445,7 @@ mod tests {
             let fused = FusedMap { lanes: vec![], changes, drives: vec![], folded_drives: 0 };
             let cell = CellId::new(CELL.0, CELL.1).unwrap();
             let known = Known { cell, events: &self.events, left: self.left, forgets: self.forgets, lanes: &[] };
-            let told = told(&known, &fused, &[]);
+            let told = told(&known, Some(&fused), &[]);
             self.version += 1;
             let at = (MapRevision(self.version), CellVersion(self.version), self.version);
             let told = number(told, self.last, 256, at);

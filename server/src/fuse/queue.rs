@@ -23,6 +23,8 @@ pub(super) enum Task {
     Locate(SessionId),
     /// A cell is dirty.
     Fuse(CellId),
+    /// A cell was drafted, and is to be fused from all of its drives.
+    Settle(CellId),
 }
 
 /// Which tasks are to be taken.
@@ -42,6 +44,7 @@ pub(super) enum Taken {
     Contribute(Box<Offer>),
     Locate(SessionId),
     Fuse(CellId),
+    Settle(CellId),
 }
 
 #[derive(Debug)]
@@ -55,21 +58,23 @@ pub(super) struct Queue {
     in_work: BTreeMap<Task, Instant>,
     /// When tasks that are done were begun last, those of the last interval.
     done: HashMap<Task, Instant>,
+    /// When the cells that are to be settled were drafted first.
+    drafted: HashMap<CellId, Instant>,
     /// How much of each session has been contributed; as many as the registry lets there be.
     contributed: HashMap<SessionId, Contributed>,
 }
 
 /// Entries of `done` after which outdated ones are dropped.
 const MOST_DONE: usize = 1024;
+/// Time for which a cell may be drafted without being settled.
+const LONGEST_DRAFTED: Duration = Duration::from_mins(1);
 
 impl Task {
-    /// What is never done at the same time: the task itself, and what else writes of the same drive.
-    fn same_drive(self) -> Vec<Self> {
+    /// What is never done at the same time: the task itself, and what else writes of the same drive or cell.
+    fn exclusive(self) -> [Self; 2] {
         match self {
-            Self::Contribute(session) | Self::Locate(session) => {
-                vec![Self::Contribute(session), Self::Locate(session)]
-            }
-            Self::Fuse(_) => vec![self],
+            Self::Contribute(session) | Self::Locate(session) => [Self::Contribute(session), Self::Locate(session)],
+            Self::Fuse(cell) | Self::Settle(cell) => [Self::Fuse(cell), Self::Settle(cell)],
         }
     }
 
@@ -77,7 +82,7 @@ impl Task {
     fn interval(self, of_cells: Duration) -> Duration {
         match self {
             Self::Contribute(_) => of_cells / 2,
-            Self::Locate(_) | Self::Fuse(_) => of_cells,
+            Self::Locate(_) | Self::Fuse(_) | Self::Settle(_) => of_cells,
         }
     }
 }
@@ -91,6 +96,7 @@ impl Queue {
             offers: HashMap::new(),
             in_work: BTreeMap::new(),
             done: HashMap::new(),
+            drafted: HashMap::new(),
             contributed: HashMap::new(),
         }
     }
@@ -118,6 +124,21 @@ impl Queue {
         self.add(Task::Fuse(cell), now);
     }
 
+    /// A cell whose draft was begun then is to be settled: once it was quiet for an interval, but not too late.
+    pub(super) fn settle_later(&mut self, cell: CellId, begun: Instant) {
+        let first = *self.drafted.entry(cell).or_insert(begun);
+        // While more comes, the next draft begins within the first of these intervals.
+        let at = (begun + 2 * self.interval).min(first + LONGEST_DRAFTED);
+        self.remove(Task::Settle(cell));
+        self.insert(Task::Settle(cell), at);
+    }
+
+    /// A cell was fused from all of its drives.
+    pub(super) fn is_settled(&mut self, cell: CellId) {
+        self.drafted.remove(&cell);
+        self.remove(Task::Settle(cell));
+    }
+
     /// A drive without GNSS is to be sought again.
     pub(super) fn locate(&mut self, session: SessionId, now: Instant) {
         self.add(Task::Locate(session), now);
@@ -129,13 +150,17 @@ impl Queue {
         }
         let again = self.done.get(&task).map(|begun| *begun + task.interval(self.interval));
         let at = again.map_or(now, |again| again.max(now));
+        self.insert(task, at);
+    }
+
+    fn insert(&mut self, task: Task, at: Instant) {
         self.waiting.insert(task, at);
         self.due.insert((at, task));
     }
 
     /// The task that became due first; or when the next one will be, `None` where there is none.
     pub(super) fn take(&mut self, now: Instant, wanted: Wanted) -> Result<Taken, Option<Instant>> {
-        let is_free = |task: &Task| task.same_drive().iter().all(|task| !self.in_work.contains_key(task));
+        let is_free = |task: &Task| task.exclusive().iter().all(|task| !self.in_work.contains_key(task));
         let is_wanted = |task: &Task| wanted == Wanted::All || matches!(task, Task::Contribute(_));
         let first = self.due.iter().find(|(_, task)| is_free(task) && is_wanted(task)).copied();
         let Some((at, task)) = first else { return Err(None) };
@@ -147,6 +172,7 @@ impl Queue {
             Task::Contribute(session) => self.offers.remove(&session).map(|offer| Taken::Contribute(Box::new(offer))),
             Task::Locate(session) => Some(Taken::Locate(session)),
             Task::Fuse(cell) => Some(Taken::Fuse(cell)),
+            Task::Settle(cell) => Some(Taken::Settle(cell)),
         };
         let Some(taken) = taken else { return self.take(now, wanted) };
         self.in_work.insert(task, now);
@@ -179,11 +205,11 @@ impl Queue {
             }
             Taken::Locate(session) => Task::Locate(session),
             Taken::Fuse(cell) => Task::Fuse(cell),
+            Taken::Settle(cell) => Task::Settle(cell),
         };
         self.in_work.remove(&task);
         self.remove(task);
-        self.waiting.insert(task, now + pause);
-        self.due.insert((now + pause, task));
+        self.insert(task, now + pause);
     }
 
     /// What a session had contributed before.
@@ -211,18 +237,19 @@ impl Queue {
     }
 
     pub(super) fn is_dirty(&self, cell: CellId) -> bool {
-        let task = Task::Fuse(cell);
-        self.waiting.contains_key(&task) || self.in_work.contains_key(&task)
+        let tasks = [Task::Fuse(cell), Task::Settle(cell)];
+        tasks.iter().any(|task| self.waiting.contains_key(task) || self.in_work.contains_key(task))
     }
 
     pub(super) fn dirty_cells(&self) -> BTreeSet<CellId> {
         let tasks = self.waiting.keys().chain(self.in_work.keys());
-        tasks.filter_map(|task| if let Task::Fuse(cell) = task { Some(*cell) } else { None }).collect()
+        let cell_of = |task: &Task| if let Task::Fuse(cell) | Task::Settle(cell) = task { Some(*cell) } else { None };
+        tasks.filter_map(cell_of).collect()
     }
 
     /// Drives whose offers are not in the store yet, or that are sought.
     pub(super) fn waiting_offers(&self) -> usize {
-        let in_work = self.in_work.keys().filter(|task| !matches!(task, Task::Fuse(_))).count();
+        let in_work = self.in_work.keys().filter(|task| !matches!(task, Task::Fuse(_) | Task::Settle(_))).count();
         let sought = self.waiting.keys().filter(|task| matches!(task, Task::Locate(_))).count();
         self.offers.len() + sought + in_work
     }
@@ -284,6 +311,35 @@ mod tests {
         assert!(
             matches!(queue.take(now + INTERVAL.mul_f64(1.9), Wanted::All), Err(Some(at)) if at == now + 2 * INTERVAL)
         );
+    }
+
+    #[test]
+    fn a_cell_that_was_drafted_is_settled_once_it_is_quiet_and_after_a_minute_at_the_latest() {
+        let settle_at = |queue: &mut Queue, now: Instant| match queue.take(now, Wanted::All) {
+            Err(Some(at)) => at,
+            other => panic!("{other:?}"),
+        };
+        let (mut queue, start) = (Queue::new(INTERVAL), Instant::now());
+        let mut now = start;
+        while now < start + LONGEST_DRAFTED - INTERVAL {
+            queue.touch_cell(cell(1), now);
+            assert_eq!(taken_cell(&mut queue, now), Some(cell(1)), "a draft comes before");
+            queue.finish(Task::Fuse(cell(1)), now);
+            queue.settle_later(cell(1), now);
+            assert!(queue.is_dirty(cell(1)));
+            let expected = (now + 2 * INTERVAL).min(start + LONGEST_DRAFTED);
+            assert_eq!(settle_at(&mut queue, now), expected);
+            now += INTERVAL;
+        }
+        let now = start + LONGEST_DRAFTED;
+        assert!(matches!(queue.take(now, Wanted::All), Ok(Taken::Settle(taken)) if taken == cell(1)));
+        queue.touch_cell(cell(1), now);
+        assert_eq!(taken_cell(&mut queue, now), None, "it is being settled");
+        queue.finish(Task::Settle(cell(1)), now);
+        queue.is_settled(cell(1));
+        assert_eq!(taken_cell(&mut queue, now + INTERVAL), Some(cell(1)));
+        queue.finish(Task::Fuse(cell(1)), now + INTERVAL);
+        assert!(!queue.is_dirty(cell(1)));
     }
 
     #[test]

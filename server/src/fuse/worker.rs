@@ -1,6 +1,7 @@
 //! A thread that cuts drives into contributions and fuses cells, one task after the other.
 
 mod contributing;
+mod fusing;
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -8,17 +9,19 @@ use std::{
     time::{Duration, Instant},
 };
 
+use fusing::Fused;
 use lanemap_core::{
     TimestampNs,
-    fleet::{CellId, DriveId, FleetParams, FusedMap},
+    fleet::{CellId, DriveId},
 };
 use lanemap_proto::v1;
 use prost::Message;
 
 use super::{
     CellRecord, CellVersion, Fuser,
-    border::{self, Crossing, Piece},
+    border::{self, Crossing},
     cell_record::fingerprint,
+    drafts::DRAFTED,
     events::{self, CellEvent, Kept, Known},
     now_ms,
     publications::Publication,
@@ -31,7 +34,6 @@ use crate::{
         cells::{CellStore, CellWrite, ContributionFact, Facts, NewVersion, encoded},
     },
     session::SessionId,
-    telemetry,
 };
 
 /// Most versions of a cell that are kept, however young.
@@ -60,12 +62,19 @@ enum Failure {
     Panic,
 }
 
-/// A cell as it was fused.
-struct Fused {
-    pieces: Vec<Piece>,
-    crossings: Vec<Crossing>,
-    map: FusedMap,
-    took: Duration,
+/// What became of a task that was done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Done {
+    Wholly,
+    /// A cell was drafted, which is still to be fused.
+    Drafted,
+}
+
+/// Whether a cell may be drafted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Demand {
+    Soon,
+    Whole,
 }
 
 /// What of a cell is replaced.
@@ -95,13 +104,18 @@ impl Worker {
                 Taken::Contribute(offer) => Task::Contribute(offer.session),
                 Taken::Locate(session) => Task::Locate(*session),
                 Taken::Fuse(cell) => Task::Fuse(*cell),
+                Taken::Settle(cell) => Task::Settle(*cell),
             };
             let outcome = self.attempt(&taken);
             let mut queue = self.fuser.queue();
             match outcome {
-                Ok(()) => {
+                Ok(done) => {
                     queue.finish(task, Instant::now());
-                    if matches!(task, Task::Fuse(_)) {
+                    if let Task::Fuse(cell) | Task::Settle(cell) = task {
+                        match done {
+                            Done::Drafted => queue.settle_later(cell, started),
+                            Done::Wholly => queue.is_settled(cell),
+                        }
                         self.fuser.seek_where_map_grew(&mut queue);
                     }
                 }
@@ -129,11 +143,12 @@ impl Worker {
     }
 
     /// Does a task. A panic in it, which is a fault of this program, ends the task and not the thread.
-    fn attempt(&self, taken: &Taken) -> Result<(), Failure> {
+    fn attempt(&self, taken: &Taken) -> Result<Done, Failure> {
         let attempt = AssertUnwindSafe(|| match taken {
-            Taken::Contribute(offer) => self.contribute(offer),
-            Taken::Locate(session) => self.locate(*session),
-            Taken::Fuse(cell) => self.fuse(*cell),
+            Taken::Contribute(offer) => self.contribute(offer).map(|()| Done::Wholly),
+            Taken::Locate(session) => self.locate(*session).map(|()| Done::Wholly),
+            Taken::Fuse(cell) => self.fuse(*cell, Demand::Soon),
+            Taken::Settle(cell) => self.fuse(*cell, Demand::Whole),
         });
         match catch_unwind(attempt) {
             Ok(outcome) => outcome.map_err(Failure::Store),
@@ -181,14 +196,19 @@ impl Worker {
     }
 
     /// Brings a cell up to date: fuses it where it is not fused from what the store has, and joins it with its neighbours.
-    fn fuse(&self, cell: CellId) -> Result<(), JournalError> {
+    fn fuse(&self, cell: CellId, demand: Demand) -> Result<Done, JournalError> {
         let mut facts = self.store.facts_of(cell)?;
         let dropped = self.drop_least_missed(cell, &mut facts)?;
         let before = self.fuser.shared.map.record(cell);
         let before = before.as_deref().cloned().unwrap_or_default();
         let purged = self.store.purges()?.contains(&cell);
         let print = fingerprint(facts.values());
-        let fused = if before.fingerprint == print { None } else { Some(self.fuse_from(cell, &facts)?) };
+        let fused = match demand {
+            _ if before.fingerprint == print => None,
+            Demand::Soon => Some(self.draft_or_fuse(cell, &facts)?),
+            Demand::Whole => Some(self.fuse_whole(cell, &facts)?),
+        };
+        let is_draft = fused.as_ref().is_some_and(|fused| fused.is_draft);
 
         let (pieces, crossings) = match &fused {
             Some(fused) => (fused.pieces.clone(), fused.crossings.clone()),
@@ -203,7 +223,8 @@ impl Worker {
         });
         let lanes = wire::lanes(&joined);
 
-        let mut record = CellRecord { crossings, fingerprint: print, ..before.clone() };
+        let fingerprint = if is_draft { DRAFTED } else { print };
+        let mut record = CellRecord { crossings, fingerprint, ..before.clone() };
         record.lanes = u32::try_from(lanes.len()).unwrap_or(u32::MAX);
         (record.line_m, record.median_lateral_sigma_m) = length_and_sigma(&lanes);
         if let Some(fused) = &fused {
@@ -222,7 +243,9 @@ impl Worker {
             let (events, earlier) = if purged { (&[][..], &[][..]) } else { (known.as_slice(), earlier) };
             let (left, forgets) = (record.events_left, record.forgets);
             let after = if purged { &[][..] } else { lanes.as_slice() };
-            events::told(&Known { cell, events, left, forgets, lanes: earlier }, &fused.map, after)
+            let known = Known { cell, events, left, forgets, lanes: earlier };
+            // What became of the road is told by all drives.
+            events::told(&known, (!is_draft).then_some(&fused.map), after)
         });
         let told = told.unwrap_or_default();
         let is_same = told.is_empty() && published.as_ref().is_some_and(|published| published.lanes == lanes);
@@ -238,7 +261,7 @@ impl Worker {
             self.write(cell, record.clone(), fused.as_ref(), next, past)?;
         }
         self.tell_neighbours(cell, &before.crossings, &record.crossings);
-        Ok(())
+        Ok(if is_draft { Done::Drafted } else { Done::Wholly })
     }
 
     /// Makes a fused cell durable, and what is new in it the next revision of the map, which readers then see.
@@ -336,17 +359,6 @@ impl Worker {
             facts.remove(session);
         }
         Ok(dropped)
-    }
-
-    fn fuse_from(&self, cell: CellId, facts: &Facts) -> Result<Fused, JournalError> {
-        let started = Instant::now();
-        let read = |session| self.store.contribution(cell, session);
-        let map = self.fuser.shared.bases.fuse(cell, facts, &FleetParams::default(), read)?;
-        let (pieces, crossings) = border::cut(cell, &map.lanes);
-        let took = started.elapsed();
-        metrics::histogram!(telemetry::FUSE_SECONDS).record(took.as_secs_f64());
-        metrics::counter!(telemetry::CELLS_FUSED).increment(1);
-        Ok(Fused { pieces, crossings, map, took })
     }
 
     /// Versions of a cell that are no longer kept: replaced long ago, beyond the most, or with a deleted drive in them.

@@ -148,7 +148,7 @@ pub struct ServerConfig {
     /// Share of a core that each of these threads takes at most, 0.01 to 1: it rests after its work.
     pub fuse_cpu_share: f64,
     /// Kilometres of line from which on a cell is drafted while up to 8 drives are live in it, 0 to 1e6: they are laid on the map of
-    /// the others, and all are fused once the cell is quiet, or after a minute.
+    /// the others, and all are fused once the cell is quiet, or after two minutes.
     pub fuse_draft_km: f64,
     /// Drives from which a cell is fused, at least 1. Of more, what is missed least is dropped: the oldest whose ways a crowd
     /// of younger ones went as well.

@@ -3,6 +3,7 @@
 mod answer;
 mod echo;
 mod flow;
+mod freshness;
 mod grpc;
 mod ingest;
 mod rate;
@@ -28,6 +29,8 @@ pub struct BenchArgs {
 enum BenchCommand {
     /// Streams drives as many vehicles and measures how long acks take.
     Ingest(ingest::IngestArgs),
+    /// Streams one vehicle through a mapped town and measures how long it takes until readers of the shared map have what it sees.
+    Freshness(freshness::FreshnessArgs),
     /// Streams the same bytes to a gRPC service that only sends them back: what the transport costs by itself.
     Echo(echo::EchoArgs),
     /// The service of `bench echo`.
@@ -39,6 +42,7 @@ enum BenchCommand {
 pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     match &args.command {
         BenchCommand::Ingest(args) => ingest::run(args),
+        BenchCommand::Freshness(args) => freshness::run(args),
         BenchCommand::Echo(args) => echo::run(args),
         BenchCommand::EchoServer => echo::serve(),
     }

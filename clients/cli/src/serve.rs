@@ -226,7 +226,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "SHARE")]
     fuse_cpu_share: Option<f64>,
     /// Kilometres of line from which on a cell is drafted while up to 8 drives are live in it, 0 to 1e6: they are laid on the map of
-    /// the others, and all are fused once the cell is quiet, or after a minute
+    /// the others, and all are fused once the cell is quiet, or after two minutes
     /// [env: LANEMAP_FUSE_DRAFT_KM] [default: 8.0]
     #[arg(long, value_name = "KM")]
     fuse_draft_km: Option<f64>,

@@ -321,7 +321,7 @@ mod tests {
         };
         let (mut queue, start) = (Queue::new(INTERVAL), Instant::now());
         let mut now = start;
-        while now < start + LONGEST_DRAFTED - INTERVAL {
+        while now + INTERVAL < start + LONGEST_DRAFTED {
             queue.touch_cell(cell(1), now);
             assert_eq!(taken_cell(&mut queue, now), Some(cell(1)), "a draft comes before");
             queue.finish(Task::Fuse(cell(1)), now);

@@ -224,7 +224,7 @@ impl Worker {
         let lanes = wire::lanes(&joined);
 
         let fingerprint = if is_draft { DRAFTED } else { print };
-        let mut record = CellRecord { crossings, fingerprint, ..before.clone() };
+        let mut record = CellRecord { fingerprint, crossings, ..before.clone() };
         record.lanes = u32::try_from(lanes.len()).unwrap_or(u32::MAX);
         (record.line_m, record.median_lateral_sigma_m) = length_and_sigma(&lanes);
         if let Some(fused) = &fused {

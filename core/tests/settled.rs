@@ -1,5 +1,7 @@
 //! What a draft promises: a live drive laid on the map of the others as it stands.
 
+#![allow(clippy::unwrap_used)] // A test's helpers fail loudly too.
+
 #[expect(dead_code, reason = "the tests of whole fusions measure by it")]
 mod roads;
 

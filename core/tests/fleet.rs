@@ -1,5 +1,6 @@
 //! What fusion promises, on roads whose truth is known in closed form.
 
+mod chains;
 mod roads;
 
 use lanemap_core::{

@@ -19,6 +19,8 @@ pub struct Beginning {
     /// Where GNSS and odometry alone put each of them.
     by_gnss: Vec<Option<Correction>>,
     corrections: Vec<Correction>,
+    /// How the base was shifted where its place was solved for together with theirs.
+    base_correction: Correction,
     placed: Vec<bool>,
     is_laid: Vec<bool>,
     lines: Lines,
@@ -55,6 +57,7 @@ impl Fusion<'_> {
             laying: laying.clone(),
             by_gnss: self.drives[drives].iter().map(|drive| drive.by_gnss.clone()).collect(),
             corrections: self.corrections[drives].to_vec(),
+            base_correction: self.corrections[self.drives.len()].clone(),
             placed: self.placed[drives].to_vec(),
             is_laid: self.is_laid[drives].to_vec(),
             lines: self.lines.clone(),
@@ -64,10 +67,11 @@ impl Fusion<'_> {
         }
     }
 
-    /// Goes on from a beginning of the same base and the same first drives.
+    /// Goes on from a beginning of the same base and the same first drives, and fewer of them.
     pub(super) fn go_on(&mut self, from: &Beginning) -> Laying {
         let drives = ..from.drives();
         self.corrections[drives].clone_from_slice(&from.corrections);
+        self.corrections[self.drives.len()].clone_from(&from.base_correction);
         self.placed[drives].copy_from_slice(&from.placed);
         self.is_laid[drives].copy_from_slice(&from.is_laid);
         self.lines = from.lines.clone();

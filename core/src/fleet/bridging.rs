@@ -173,6 +173,11 @@ impl Fusion<'_> {
             line.move_by(&by_m);
         }
         self.lines.index();
+        self.find_ways();
+    }
+
+    /// Finds anew where the drives went that are laid, from their corrections as they are.
+    pub(super) fn find_ways(&mut self) {
         self.ways = self.base_ways().clone();
         for drive in (0..self.drives.len()).filter(|drive| self.is_laid[*drive]) {
             for pass in &self.drives[drive].passes {

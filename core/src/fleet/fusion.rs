@@ -1,7 +1,8 @@
 //! Fusion: contributions in, one map out. A pure function, whatever the order in which contributions arrived.
 //!
-//! Drives are taken in the order of their starts. Each is laid on the lines so far and adds to them. Then all
-//! corrections are solved together, and the lines are made again from them, a few times over.
+//! Drives are taken in the order of their starts. Each is laid on the lines so far and adds to them; whenever their number
+//! has doubled, what is known is spread over them. Then all corrections are solved together, and the lines are made again
+//! from them, a few times over.
 //!
 //! So that a place that thousands of drives pass costs no more than one that a few do, the oldest are folded, a crowd at a
 //! time, into a [`Base`]: lines that stay as they are, with the information of all of them, as one more drive that may
@@ -10,6 +11,7 @@
 
 mod kept_apart;
 mod laying;
+mod spreading;
 
 use std::collections::BTreeMap;
 
@@ -151,6 +153,8 @@ pub fn fuse_from(
     params: &FleetParams,
     keep: Keep,
 ) -> Fused {
+    // What is spread once so many lie is not where no other follows.
+    let beginning = beginning.filter(|beginning| beginning.drives() < drives.len());
     let known = |drive: usize| beginning.and_then(|beginning| beginning.by_gnss(drive));
     let prepared = drives.iter().enumerate().map(|(number, contribution)| match known(number) {
         Some(by_gnss) => PreparedDrive::of(contribution, by_gnss.clone(), anchor, params),
@@ -268,6 +272,37 @@ impl<'a> Fusion<'a> {
 
     /// Solves for all corrections and all lines together.
     fn align_all(&mut self) {
+        let all: Vec<usize> = (0..self.corrections.len()).collect();
+        let mut eliminations = std::mem::take(&mut self.eliminations);
+        self.align_some(&all, &mut eliminations);
+        self.eliminations = eliminations;
+    }
+
+    /// Solves for the corrections of some drives, among them all that lie on lines, and for all lines together. `drives` are in
+    /// their order; the base counts as the last.
+    fn align_some(&mut self, drives: &[usize], eliminations: &mut Eliminations) {
+        let (mut sightings, stations) = self.sightings_of_lines();
+        let mut positions = vec![0; self.corrections.len()];
+        for (position, drive) in drives.iter().enumerate() {
+            positions[*drive] = position;
+        }
+        for sighting in &mut sightings {
+            sighting.drive = positions[sighting.drive];
+        }
+        let restraints: Vec<&Restraints> = drives.iter().map(|drive| &self.restraints[*drive]).collect();
+        let mut corrections: Vec<Correction> = drives.iter().map(|drive| self.corrections[*drive].clone()).collect();
+        let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
+        align(&restraints, &mut corrections, &sightings, stations, scales, eliminations);
+        for (drive, correction) in drives.iter().zip(corrections) {
+            self.corrections[*drive] = correction;
+        }
+        if self.base.is_held {
+            self.corrections[self.drives.len()] = Correction::identity();
+        }
+    }
+
+    /// What the witnesses of all lines saw, with how many stations; the lines' own places are unknown.
+    fn sightings_of_lines(&self) -> (Vec<Sighting>, usize) {
         let mut sightings = Vec::new();
         let mut stations = 0;
         let deflation = self.params.lane_correlation_m / (STATION_KNOTS as f64 * self.params.line_knot_m);
@@ -291,12 +326,7 @@ impl<'a> Fusion<'a> {
                 stations += 1;
             }
         }
-        let restraints: Vec<&Restraints> = self.restraints.iter().collect();
-        let scales = RobustScales { lanes_m: self.params.robust_scale_m, fixes_m: self.params.gnss_robust_scale_m };
-        align(&restraints, &mut self.corrections, &sightings, stations, scales, &mut self.eliminations);
-        if self.base.is_held {
-            self.corrections[self.drives.len()] = Correction::identity();
-        }
+        (sightings, stations)
     }
 
     /// Weighs the shape that receivers tell, from the next alignment on, by how far they disagree about it.

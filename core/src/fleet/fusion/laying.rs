@@ -42,6 +42,9 @@ impl Fusion<'_> {
             }
             laying.passes += self.drives[drive].passes.len();
             laying.drives += 1;
+            if laying.drives < self.drives.len() && self.spreads_after(laying.drives) {
+                self.spread();
+            }
         }
         if self.are_outvoted(&laying) {
             self.begin_with_refused(&mut laying);

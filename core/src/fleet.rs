@@ -5,7 +5,8 @@
 //!
 //! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
 //! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
-//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). What was made of the oldest is kept where only younger ones change ([`beginning`]).
+//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). What was made of the oldest is kept where only younger ones
+//!    change ([`beginning`]).
 //! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
 //!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky; how far
@@ -16,6 +17,8 @@
 //!    (`persistence`, `moved`), the most likely history of each stretch (`history`), and that of its paint (`repainted`).
 //! 7. [`mod@line`]: every knot of a line is the weighted mean of what each drive says of it: one drive, one witness; where
 //!    witnesses come and go, the line runs on as they say its shape is (`continuity`).
+//!
+//! Until there is time to fuse all drives, [`draft`] shows live ones on what is [`settled`] of the others.
 //!
 //! ```
 //! use lanemap_core::{fleet::*, geometry::georeference::{Anchor, Georeference, Wgs84}, *};

@@ -93,15 +93,6 @@ impl Drafts {
         self.known.insert(cell, Arc::clone(&known));
         Some(known)
     }
-
-    /// Takes what a fusion of all drives settled, unless few came since what is known: those that are live would have to be taken out
-    /// again.
-    pub(super) fn settle_whole(&self, cell: CellId, facts: &Facts, settled: Settled) {
-        let is_known = matches!(self.of(cell, facts), Some(Draft::Onto(_, live)) if 2 * live.len() <= MOST_LIVE);
-        if !is_known {
-            self.settle(cell, facts.clone(), settled);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -167,17 +158,5 @@ mod tests {
         let drafts = Drafts::new(1e3);
         assert!(drafts.settle(cell(), facts([(1, 1)]), settled()).is_none());
         assert!(drafts.of(cell(), &facts([(1, 1), (2, 1)])).is_none());
-    }
-
-    #[test]
-    fn what_a_whole_fusion_settles_is_taken_once_many_have_come() {
-        let drafts = Drafts::new(0.0);
-        drafts.settle(cell(), facts([(1, 1)]), settled());
-        let few = facts([(1, 1), (2, 1)]);
-        drafts.settle_whole(cell(), &few, settled());
-        assert_eq!(drafts.known.get(&cell()).unwrap().members, facts([(1, 1)]));
-        let many = facts((1..=2 + MOST_LIVE as u64 / 2).map(|number| (number, 1)));
-        drafts.settle_whole(cell(), &many, settled());
-        assert_eq!(drafts.known.get(&cell()).unwrap().members, many);
     }
 }

@@ -48,7 +48,7 @@ impl Worker {
         let started = Instant::now();
         let fused = self.fuse_all(cell, facts)?;
         if let Some(settled) = fused.settled {
-            self.fuser.shared.drafts.settle_whole(cell, facts, settled);
+            self.fuser.shared.drafts.settle(cell, facts.clone(), settled);
         }
         let fused = Fused::of(cell, fused.map, started, false);
         metrics::histogram!(telemetry::FUSE_SECONDS).record(fused.took.as_secs_f64());

@@ -18,7 +18,10 @@ use lanemap_simulator::{Fleet, FleetScenario, Seed};
 use serde::Serialize;
 use tokio::time::{Duration, Instant, interval, timeout};
 
-use super::server_process::ServerProcess;
+use super::{
+    rate::FrameRate,
+    server_process::{self, ServerProcess},
+};
 
 /// Longest wait for a line after the last frame.
 const PATIENCE: Duration = Duration::from_secs(15);
@@ -37,9 +40,9 @@ pub struct FreshnessArgs {
     /// Seed of the simulated town
     #[arg(long, value_name = "N", default_value_t = 3)]
     seed: u64,
-    /// Frames per second of the vehicle
-    #[arg(long, value_name = "R", default_value_t = 10.0)]
-    hz: f64,
+    /// Frames per second of the vehicle; max: as fast as acks allow
+    #[arg(long, value_name = "R|max", default_value = "10")]
+    hz: FrameRate,
     /// The server, whose map should be empty; without it one is started for the length of the run, its store in a temporary
     /// folder; LANEMAP_ variables set it up
     #[arg(long, value_name = "URL")]
@@ -68,7 +71,6 @@ struct FreshnessReport {
 
 /// Drives, watches and reports; the exit code is 1 where fewer than nine tenths of the frames became readable.
 pub fn run(args: &FreshnessArgs) -> anyhow::Result<ExitCode> {
-    ensure!((0.1..=100.0).contains(&args.hz), "--hz {} is outside 0.1 ..= 100", args.hz);
     let spawned = if args.server.is_none() { Some(ServerProcess::serve(None)?) } else { None };
     let url = args.server.as_deref().or(spawned.as_ref().map(|server| server.url.as_str()));
     let url = url.context("there is no server")?;
@@ -76,10 +78,10 @@ pub fn run(args: &FreshnessArgs) -> anyhow::Result<ExitCode> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let report = runtime.block_on(async {
         for number in 0..args.drives {
-            stream(url, &fleet, number, usize::MAX, None).await?;
+            stream(url, &fleet, number, usize::MAX, FrameRate::Max).await?;
         }
         settled(url).await?;
-        stream(url, &fleet, args.drives, WARMING, Some(args.hz)).await?;
+        stream(url, &fleet, args.drives, WARMING, args.hz).await?;
         settled(url).await?;
         tokio::time::sleep(REST).await;
         freshness(url, &fleet, args).await
@@ -107,7 +109,7 @@ fn town(args: &FreshnessArgs) -> Fleet {
 type Sent = Arc<Mutex<Vec<Instant>>>;
 
 /// Streams a drive, or its first frames, and ends it: as fast as acks allow, or at a rate.
-async fn stream(url: &str, fleet: &Fleet, number: u32, frames: usize, hz: Option<f64>) -> anyhow::Result<()> {
+async fn stream(url: &str, fleet: &Fleet, number: u32, frames: usize, hz: FrameRate) -> anyhow::Result<()> {
     let frames: Vec<Frame> = fleet.drive(number).frames().take(frames).collect();
     stream_frames(url, fleet, number, &frames, hz, &Sent::default()).await
 }
@@ -117,14 +119,14 @@ async fn stream_frames(
     fleet: &Fleet,
     number: u32,
     frames: &[Frame],
-    hz: Option<f64>,
+    hz: FrameRate,
     sent: &Sent,
 ) -> anyhow::Result<()> {
     let client = IngestClient::connect(url).await?;
     let sensor = fleet.drive(number).sensor();
     let start = SessionStart { sensor, ..SessionStart::new("bench", format!("vehicle-{number}"), "drive") };
     let (mut session, _events) = client.start_session(start).await?;
-    let mut ticks = hz.map(|hz| interval(Duration::from_secs_f64(1.0 / hz)));
+    let mut ticks = hz.hz().map(|hz| interval(Duration::from_secs_f64(1.0 / hz)));
     for frame in frames {
         if let Some(ticks) = &mut ticks {
             ticks.tick().await;
@@ -139,12 +141,10 @@ async fn stream_frames(
 
 /// Waits until the map has all that drives have said.
 async fn settled(url: &str) -> anyhow::Result<()> {
-    // Somebody in the process must name the cryptography that reqwest does not bring.
-    let _ = rustls::crypto::ring::default_provider().install_default();
     let asking = async {
         loop {
-            let cells = reqwest::get(format!("{url}/cells")).await?.error_for_status()?.bytes().await?;
-            let cells: serde_json::Value = serde_json::from_slice(&cells)?;
+            let cells = server_process::text(&format!("{url}/cells")).await?;
+            let cells: serde_json::Value = serde_json::from_str(&cells)?;
             if cells["settled"] == true {
                 return Ok(());
             }
@@ -164,7 +164,7 @@ async fn freshness(url: &str, fleet: &Fleet, args: &FreshnessArgs) -> anyhow::Re
     while timeout(Duration::from_secs(2), watch.next()).await.is_ok_and(|news| news.is_ok()) {}
     let sent = Sent::default();
     let reading = tokio::spawn(readable(watch, times, Arc::clone(&sent)));
-    stream_frames(url, fleet, number, &frames, Some(args.hz), &sent).await?;
+    stream_frames(url, fleet, number, &frames, args.hz, &sent).await?;
     let (mut readable_s, versions) = reading.await??;
     readable_s.sort_by(f64::total_cmp);
     let at = |share: f64| {

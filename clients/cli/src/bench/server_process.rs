@@ -78,12 +78,17 @@ pub fn free_zenoh_endpoint() -> anyhow::Result<(String, TcpSocket)> {
     Ok((format!("tcp/{}", held.local_addr()?), held))
 }
 
+/// What a server answers at an address.
+pub async fn text(url: &str) -> anyhow::Result<String> {
+    // Somebody in the process must name the cryptography that reqwest does not bring.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    Ok(reqwest::get(url).await?.error_for_status()?.text().await?)
+}
+
 /// Memory that the process of a server elsewhere holds, MB, as its metrics say.
 pub async fn rss_mb_by_metrics(url: &str) -> anyhow::Result<f64> {
     let url = format!("{}/metrics", url.trim_end_matches('/'));
-    // Somebody in the process must name the cryptography that reqwest does not bring.
-    let _ = rustls::crypto::ring::default_provider().install_default();
-    let metrics = reqwest::get(&url).await?.error_for_status()?.text().await?;
+    let metrics = text(&url).await?;
     let resident = metrics.lines().find_map(|line| line.strip_prefix("process_resident_memory_bytes "));
     let bytes = resident.with_context(|| format!("{url} has no process_resident_memory_bytes"))?;
     Ok(bytes.trim().parse::<f64>()? / 1e6)

@@ -8,9 +8,10 @@ use std::path::Path;
 use lanemap_proto::v1::{self, admin_service_client::AdminServiceClient};
 use lanemap_server::{Server, ServerConfig, fuse::SharedMap};
 use lanemap_tests::{
-    fleets::{FLEET, WireDrive, along_a_road, cell_maps, settled, settled_where},
+    fleets::{FLEET, PATIENCE, WireDrive, along_a_road, cell_maps, settled, settled_where},
     http, servers,
 };
+use tokio::time::timeout;
 
 /// A server that drafts every cell, and fuses it long enough afterwards for a test to look at the draft.
 fn drafting(folder: &Path, key: &Path) -> ServerConfig {
@@ -45,9 +46,12 @@ async fn drafts(url: &str) -> f64 {
 /// Waits for the next version of the only cell.
 async fn next_version(map: &SharedMap, version: u64) {
     let mut publications = map.publications();
-    while map.list()[0].1.version.0 <= version {
-        publications.changed().await.unwrap();
-    }
+    let coming = async {
+        while map.list()[0].1.version.0 <= version {
+            publications.changed().await.unwrap();
+        }
+    };
+    timeout(PATIENCE, coming).await.expect("another version comes");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -106,7 +110,11 @@ async fn a_drive_that_is_deleted_leaves_drafted_cells_too() {
     drives[0].upload_whole(&url).await;
     drives[1].upload_whole(&url).await;
     settled(&server).await;
+    // The deleted drive is in what the live one is laid on.
+    let (already, version) = (drafts(&url).await, server.map().list()[0].1.version.0);
     drives[2].upload(&url, drives[2].frames.len() / 2, false).await;
+    next_version(server.map(), version).await;
+    assert!(drafts(&url).await > already);
     let mut admin = AdminServiceClient::connect(url.clone()).await.unwrap();
     let vehicle_id = drives[0].start.vehicle_id.clone();
     let request = v1::ForgetRequest { fleet_id: FLEET.to_owned(), vehicle_id, drive_id: None };

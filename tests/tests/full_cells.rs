@@ -2,11 +2,22 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test's helpers fail loudly too.
 
+use std::path::Path;
+
 use lanemap_server::{Server, ServerConfig};
 use lanemap_tests::{
     fleets::{WireDrive, along_a_road, cell_maps, settled, settled_where},
     servers,
 };
+
+/// A server that keeps so many drives of a cell, with the names that a key gives.
+fn keeping(drives: usize, folder: &Path, key: &Path) -> ServerConfig {
+    ServerConfig {
+        privacy_key_file: key.join("privacy.key"),
+        max_contributions_per_cell: drives,
+        ..servers::config(folder)
+    }
+}
 
 #[tokio::test(flavor = "multi_thread")]
 async fn of_more_drives_than_a_cell_keeps_the_youngest_count_in_any_order_of_upload() {
@@ -15,12 +26,7 @@ async fn of_more_drives_than_a_cell_keeps_the_youngest_count_in_any_order_of_upl
     let mut maps = Vec::new();
     for order in [vec![0, 1, 2], vec![2, 1, 0], vec![1, 2]] {
         let folder = tempfile::tempdir().unwrap();
-        let config = ServerConfig {
-            privacy_key_file: key.path().join("privacy.key"),
-            max_contributions_per_cell: 2,
-            ..servers::config(folder.path())
-        };
-        let server = Server::start(config).await.unwrap();
+        let server = Server::start(keeping(2, folder.path(), key.path())).await.unwrap();
         for index in order {
             drives[index].upload_whole(&server.url()).await;
         }
@@ -41,12 +47,7 @@ async fn the_road_that_only_the_oldest_drive_went_stays_when_a_full_cell_lets_go
     let mut maps = Vec::new();
     for last_first in [false, true] {
         let folder = tempfile::tempdir().unwrap();
-        let config = ServerConfig {
-            privacy_key_file: key.path().join("privacy.key"),
-            max_contributions_per_cell: 4,
-            ..servers::config(folder.path())
-        };
-        let server = Server::start(config).await.unwrap();
+        let server = Server::start(keeping(4, folder.path(), key.path())).await.unwrap();
         let record = || server.map().list().remove(0).1;
         if !last_first {
             drives[0].upload_whole(&server.url()).await;
@@ -69,13 +70,8 @@ async fn the_road_that_only_the_oldest_drive_went_stays_when_a_full_cell_lets_go
         let mut cell = cell_maps(&server.url()).await.remove(0);
         assert!(cell.lanes.iter().any(|lane| lane.drives == 4), "the oldest drive and the youngest saw one road");
         // The same after a restart.
-        let config = ServerConfig {
-            privacy_key_file: key.path().join("privacy.key"),
-            max_contributions_per_cell: 4,
-            ..servers::config(folder.path())
-        };
         server.shutdown().await;
-        let server = Server::start(config).await.unwrap();
+        let server = Server::start(keeping(4, folder.path(), key.path())).await.unwrap();
         settled(&server).await;
         assert_eq!(cell_maps(&server.url()).await, [cell.clone()]);
         cell.version = 0;

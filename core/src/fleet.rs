@@ -5,8 +5,9 @@
 //!
 //! 1. [`correction`]: every drive gets a smooth correction of 4 degrees of freedom, at first from its GNSS fixes alone.
 //! 2. [`placement`]: in the order of their starts, drives are laid on the lines of those before: a search over lateral
-//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). What was made of the oldest is kept where only younger ones
-//!    change ([`beginning`]).
+//!    shifts, which must be unique to be believed (`ways` tell the lanes of the two directions apart). Whenever their number has
+//!    doubled, they are solved for together (`fusion`). What was made of the oldest is kept where only younger ones change
+//!    ([`beginning`]).
 //! 3. [`matching`]: which stretch of a drive's lane lies on which line; what lies on none begins or extends one, and two that
 //!    a drive saw as one are joined (`growth`, `joining`).
 //! 4. [`alignment`]: all corrections and all lines in one sparse least-squares problem, robust, solved by Cholesky; how far

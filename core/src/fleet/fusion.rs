@@ -296,6 +296,7 @@ impl<'a> Fusion<'a> {
         for (drive, correction) in drives.iter().zip(corrections) {
             self.corrections[*drive] = correction;
         }
+        // What its weights left of a shift.
         if self.base.is_held {
             self.corrections[self.drives.len()] = Correction::identity();
         }

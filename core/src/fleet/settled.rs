@@ -6,8 +6,8 @@
 //! `C = argmin |odometry|^2 + |fixes|^2 + sum rho(n . C(p) - mu) / s^2`,
 //!
 //! `mu` the lines of the others with the information of all of them, as a fold leaves it ([`base`](super::base)), here without
-//! the inflation that a fold pays for being final. What the drive saw becomes a mean of that and of what it says; what it saw first is drawn
-//! at once. All else stays to the bit: readers of changes hear of the live drive alone.
+//! the inflation that a fold pays for being final. What the drive saw becomes a mean of that and of what it says; what it saw
+//! first is drawn at once. All else stays where it is; beside what it saw a line runs on (`continuity`), by less with every knot.
 //!
 //! Not guaranteed: the map that fusing all of them gives. A draft moves no other drive, and what became of a road in the drives that
 //! are settled is taken as known when a live drive misses something. It is to be followed by a fusion of all.

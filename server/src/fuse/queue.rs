@@ -134,7 +134,7 @@ impl Queue {
     }
 
     /// A cell was fused from all of its drives.
-    pub(super) fn is_settled(&mut self, cell: CellId) {
+    pub(super) fn has_settled(&mut self, cell: CellId) {
         self.drafted.remove(&cell);
         self.remove(Task::Settle(cell));
     }
@@ -336,7 +336,7 @@ mod tests {
         queue.touch_cell(cell(1), now);
         assert_eq!(taken_cell(&mut queue, now), None, "it is being settled");
         queue.finish(Task::Settle(cell(1)), now);
-        queue.is_settled(cell(1));
+        queue.has_settled(cell(1));
         assert_eq!(taken_cell(&mut queue, now + INTERVAL), Some(cell(1)));
         queue.finish(Task::Fuse(cell(1)), now + INTERVAL);
         assert!(!queue.is_dirty(cell(1)));

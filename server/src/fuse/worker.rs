@@ -114,7 +114,7 @@ impl Worker {
                     if let Task::Fuse(cell) | Task::Settle(cell) = task {
                         match done {
                             Done::Drafted => queue.settle_later(cell, started),
-                            Done::Wholly => queue.is_settled(cell),
+                            Done::Wholly => queue.has_settled(cell),
                         }
                         self.fuser.seek_where_map_grew(&mut queue);
                     }

@@ -1,7 +1,9 @@
 //! What a stream has yet to send to its vehicle, bounded in every part.
 //!
-//! Acks are merged: the newest says all. Poses and local maps are dropped, oldest first, where the vehicle does not read
-//! them. Refusals and gaps are kept; a stream that has too many unread is not read from until the vehicle reads again.
+//! Refusals and gaps are kept, and none is overtaken by a later ack: what an ack covers but for those is durable, so that a
+//! vehicle must know of them first. Acks with none between them are merged: the newest says all. A stream that has too many
+//! unread is not read from until the vehicle reads again. Poses and local maps are dropped, oldest first, where the vehicle
+//! does not read them.
 
 use std::{
     collections::VecDeque,
@@ -20,7 +22,7 @@ use tonic::Status;
 use super::Refusal;
 use crate::telemetry;
 
-/// Refusals and gaps that may wait to be read.
+/// Refusals and gaps that may wait to be read, with the acks among them.
 const MAX_NOTICES: usize = 64;
 /// Poses and local maps that may wait to be read.
 const MAX_UPDATES: usize = 128;
@@ -47,8 +49,8 @@ struct Shared {
 #[derive(Debug, Default)]
 struct Waiting {
     accepted: Option<v1::SessionAccepted>,
-    ack: Option<Sequence>,
-    notices: VecDeque<Message>,
+    /// Acks, refusals and gaps in their order, no two acks in a row.
+    promises: VecDeque<Message>,
     updates: VecDeque<Message>,
     ended: Option<v1::SessionEnded>,
     finish: Option<Result<(), Status>>,
@@ -70,7 +72,10 @@ impl Outbox {
 
     /// Every frame up to `sequence` is durable.
     pub fn ack(&self, sequence: Sequence) {
-        self.put(|waiting| waiting.ack = Some(sequence));
+        self.put(|waiting| {
+            waiting.promises.pop_back_if(|last| matches!(last, Message::Ack(_)));
+            waiting.promises.push_back(Message::Ack(v1::Ack { acked_sequence_inclusive: sequence.0 }));
+        });
     }
 
     /// A pose or a local map.
@@ -105,8 +110,8 @@ impl Outbox {
                 if waiting.closed || waiting.finish.is_some() {
                     return;
                 }
-                if waiting.notices.len() < MAX_NOTICES {
-                    waiting.notices.push_back(notice);
+                if waiting.promises.len() < MAX_NOTICES {
+                    waiting.promises.push_back(notice);
                     break;
                 }
             }
@@ -165,13 +170,8 @@ impl Waiting {
         if let Some(accepted) = self.accepted.take() {
             return Some(Message::Accepted(accepted));
         }
-        if let Some(sequence) = self.ack.take() {
-            return Some(Message::Ack(v1::Ack { acked_sequence_inclusive: sequence.0 }));
-        }
-        if let Some(notice) = self.notices.pop_front() {
-            return Some(notice);
-        }
-        self.updates.pop_front().or_else(|| self.ended.take().map(Message::Ended))
+        let waiting = self.promises.pop_front().or_else(|| self.updates.pop_front());
+        waiting.or_else(|| self.ended.take().map(Message::Ended))
     }
 }
 
@@ -224,6 +224,19 @@ mod tests {
         outbox.finish(Ok(()));
         let messages: Vec<_> = stream.map(|message| message.unwrap().message.unwrap()).collect().await;
         assert_eq!(messages, [Message::Ack(v1::Ack { acked_sequence_inclusive: 1000 })]);
+    }
+
+    #[tokio::test]
+    async fn no_ack_overtakes_a_gap_that_was_told_before_it() {
+        let (outbox, stream) = Outbox::new();
+        let ack = |acked_sequence_inclusive| Message::Ack(v1::Ack { acked_sequence_inclusive });
+        let gap = v1::Gap { first_missing_sequence: 3, last_missing_sequence: 4 };
+        [1, 2].map(|sequence| outbox.ack(Sequence(sequence)));
+        outbox.gap(&(3..=4)).await;
+        [5, 6].map(|sequence| outbox.ack(Sequence(sequence)));
+        outbox.finish(Ok(()));
+        let messages: Vec<_> = stream.map(|message| message.unwrap().message.unwrap()).collect().await;
+        assert_eq!(messages, [ack(2), Message::Gap(gap), ack(6)]);
     }
 
     #[tokio::test]

@@ -231,9 +231,9 @@ mod tests {
         let (outbox, stream) = Outbox::new();
         let ack = |acked_sequence_inclusive| Message::Ack(v1::Ack { acked_sequence_inclusive });
         let gap = v1::Gap { first_missing_sequence: 3, last_missing_sequence: 4 };
-        [1, 2].map(|sequence| outbox.ack(Sequence(sequence)));
+        (1..=2).for_each(|sequence| outbox.ack(Sequence(sequence)));
         outbox.gap(&(3..=4)).await;
-        [5, 6].map(|sequence| outbox.ack(Sequence(sequence)));
+        (5..=6).for_each(|sequence| outbox.ack(Sequence(sequence)));
         outbox.finish(Ok(()));
         let messages: Vec<_> = stream.map(|message| message.unwrap().message.unwrap()).collect().await;
         assert_eq!(messages, [ack(2), Message::Gap(gap), ack(6)]);

@@ -347,17 +347,10 @@ impl Mapper {
         for (position, old_run) in scene.runs.iter().enumerate() {
             for (further, young_run) in scene.runs.iter().enumerate().skip(position + 1) {
                 let (old, young) = (old_run.lane, young_run.lane);
-                let (old_seen, young_seen) = (self.seen_now.contains(&old), self.seen_now.contains(&young));
-                if joined.contains(&old) || joined.contains(&young) || (!old_seen && !young_seen) {
-                    continue;
-                }
-                // Two that are both seen only matter where they were suspected to be one.
-                if old_seen && young_seen && !self.is_rival(young, old) {
-                    continue;
-                }
-                if scene.may_run_together(position, further)
-                    && self.run_together(old_run, young_run)
-                    && self.judge_pair(old, young, old_seen && young_seen)
+                if !joined.contains(&old)
+                    && !joined.contains(&young)
+                    && scene.may_run_together(position, further)
+                    && self.are_one(old_run, young_run)
                 {
                     self.join(old_run, young);
                     joined.push(young);
@@ -367,17 +360,32 @@ impl Mapper {
         joined
     }
 
-    fn run_together(&self, old: &NearbyRun, young: &NearbyRun) -> bool {
-        let (Some(a), Some(b)) = (self.lanes.get(&old.lane), self.lanes.get(&young.lane)) else { return false };
+    /// Whether two lanes turn out to be one by what this frame shows of them.
+    fn are_one(&mut self, old_run: &NearbyRun, young_run: &NearbyRun) -> bool {
+        let unseen = match (self.seen_now.contains(&old_run.lane), self.seen_now.contains(&young_run.lane)) {
+            (true, true) => None,
+            (true, false) => Some(self.detection_probability(young_run)),
+            (false, true) => Some(self.detection_probability(old_run)),
+            (false, false) => return false,
+        };
+        let is_telling = |young| duplicate::is_telling(young, old_run.lane, unseen);
+        if !self.lanes.get(&young_run.lane).is_some_and(is_telling) {
+            return false;
+        }
+        let Some(distance_m) = self.run_together(old_run, young_run) else { return false };
+        let Some(young) = self.lanes.get_mut(&young_run.lane) else { return false };
+        duplicate::judge(young, old_run.lane, unseen.is_none(), distance_m)
+    }
+
+    fn run_together(&self, old: &NearbyRun, young: &NearbyRun) -> Option<f64> {
+        let (a, b) = (self.lanes.get(&old.lane)?, self.lanes.get(&young.lane)?);
         duplicate::run_together(b, (young.first, young.last), a, (old.first, old.last), &self.params.landmark)
     }
 
-    fn is_rival(&self, young: LaneId, old: LaneId) -> bool {
-        self.lanes.get(&young).is_some_and(|lane| lane.rival.is_some_and(|(rival, _)| rival == old))
-    }
-
-    fn judge_pair(&mut self, old: LaneId, young: LaneId, both_seen: bool) -> bool {
-        self.lanes.get_mut(&young).is_some_and(|lane| duplicate::judge(lane, old, both_seen))
+    fn detection_probability(&self, run: &NearbyRun) -> f64 {
+        let pose = &self.pose.map_from_vehicle;
+        let of = |lane| scene::detection_probability(lane, run, pose, &self.sensor, &self.params);
+        self.lanes.get(&run.lane).map_or(0.0, of)
     }
 
     fn join(&mut self, old_run: &NearbyRun, young: LaneId) {

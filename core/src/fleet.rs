@@ -69,6 +69,7 @@ pub mod contribution;
 pub mod correction;
 mod credibility;
 mod crowding;
+mod double_line;
 pub mod fusion;
 mod georeferenced;
 mod growth;

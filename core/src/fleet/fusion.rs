@@ -388,6 +388,8 @@ impl<'a> Fusion<'a> {
             run_on(line, self.params);
         }
         self.lines.index();
+        self.gather_lone_sightings();
+        self.lines.index();
         self.part_moved(&mut pieces);
         self.lines.index();
     }

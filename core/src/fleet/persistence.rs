@@ -6,6 +6,7 @@
 //! that is worn, or painted on bad ground, is missed more often by all, which is learned too.
 //!
 //! A pass whose own lane lies beside the knot, nearer than two lines lie, saw the same paint on another line: it says nothing.
+//! It misses the knot if the two are a double line ([`double_line`](super::double_line)).
 //! What follows from it all is found in [`history`](super::history).
 
 use nalgebra::{Point3, Vector3};
@@ -13,6 +14,7 @@ use nalgebra::{Point3, Vector3};
 use super::{
     contribution::DriveId,
     correction::Correction,
+    double_line::DoubleLines,
     fusion::Fusion,
     history::{Belief, histories},
     line::{BASE, Knot, Lines},
@@ -32,6 +34,10 @@ const MANY_VIEWS: u16 = 5;
 const SIDES_M: [f64; 4] = [4.0, 8.0, 10.0, 11.5];
 /// Probability that a pass has a line among its lanes, by the class of distance to the side, until the drives tell it.
 const USUAL: [f64; SIDES_M.len() + 1] = [0.97, 0.95, 0.85, 0.6, 0.25];
+/// By what factor it is less likely that it has one of a double line.
+const OF_DOUBLE_LINE: f64 = 0.8;
+/// Classes of views: by the distance to the side, whether of a double line, and from how many places.
+const CLASSES: usize = 4 * USUAL.len();
 /// Knots that the usual probabilities count for.
 const USUAL_KNOTS: f64 = 150.0;
 /// Knots that a line counts for as one like the others.
@@ -46,7 +52,7 @@ const SAME_KNOT_M: f64 = 2.6;
 const NO_ROOM_M: f64 = 2.3;
 /// Probability that a pass has a lane where there is none.
 const GHOST: f64 = 0.03;
-/// The same beside a line that more drives saw.
+/// The same beside a line that more drives saw, and of a double line.
 const GHOST_BESIDE: f64 = 0.15;
 
 /// Who says something of a knot, and when: a drive and its start.
@@ -111,7 +117,8 @@ impl Fusion<'_> {
             let hearings: Vec<Vec<Hearing>> = (0..sights.len())
                 .map(|knot| {
                     let is_beside = self.is_beside_a_stronger_line(index, knot, &drives);
-                    let ghost = if is_beside { GHOST_BESIDE } else { GHOST };
+                    let is_doubtful = is_beside || look.double_lines.contain(index, knot);
+                    let ghost = if is_doubtful { GHOST_BESIDE } else { GHOST };
                     let hearing = |sight: &Sight| Hearing {
                         pass: sight.pass,
                         seen: sight.seen,
@@ -151,9 +158,9 @@ impl Fusion<'_> {
     }
 }
 
-fn class_of(view: View) -> usize {
+fn class_of(view: View, is_double: bool) -> usize {
     let side = SIDES_M.iter().position(|limit_m| f64::from(view.side_m) < *limit_m).unwrap_or(SIDES_M.len());
-    2 * side + usize::from(view.places >= MANY_VIEWS)
+    4 * side + 2 * usize::from(is_double) + usize::from(view.places >= MANY_VIEWS)
 }
 
 /// Passes that saw or missed a knot between the first and the last that saw it: there it surely was.
@@ -170,9 +177,11 @@ fn while_there(knot: &[Sight]) -> &[Sight] {
 fn learned_chances(sights: &[Vec<Vec<Sight>>]) -> Vec<f64> {
     /// Passes that must have seen a knot for it to be one to learn from.
     const LEAST_SEEN: usize = 4;
-    let mut counts: Vec<(f64, f64)> = (0..2 * USUAL.len())
+    let mut counts: Vec<(f64, f64)> = (0..CLASSES)
         .map(|class| {
-            let usual = USUAL[class / 2] * if class % 2 == 0 { 0.9 } else { 1.0 };
+            let (is_double, many_views) = (class / 2 % 2 == 1, class % 2 == 1);
+            let of_double = if is_double { OF_DOUBLE_LINE } else { 1.0 };
+            let usual = USUAL[class / 4] * of_double * if many_views { 1.0 } else { 0.9 };
             (usual * USUAL_KNOTS, USUAL_KNOTS)
         })
         .collect();
@@ -232,6 +241,7 @@ fn seen_by_pass(lines: &Lines) -> Vec<Vec<Seen>> {
 /// What one pass had in view and saw: a pass comes to few of the knots of a town, and only those are looked at.
 struct Look<'a> {
     lines: &'a Lines,
+    double_lines: DoubleLines,
     /// Number of the first knot of each line among all.
     first: Vec<usize>,
     /// Of each knot.
@@ -249,7 +259,14 @@ impl<'a> Look<'a> {
             knots - line.points.len()
         });
         let first = first.collect();
-        Self { lines, first, views: vec![View::NONE; knots], own: vec![None; knots], in_view: Vec::new() }
+        Self {
+            lines,
+            double_lines: DoubleLines::of(lines),
+            first,
+            views: vec![View::NONE; knots],
+            own: vec![None; knots],
+            in_view: Vec::new(),
+        }
     }
 
     fn number(&self, line: usize, knot: usize) -> usize {
@@ -292,7 +309,7 @@ impl<'a> Look<'a> {
         let Ok(pass) = u32::try_from(number) else { return };
         for Seen { line, knot, .. } in seen {
             let (line, knot) = (*line as usize, *knot as usize);
-            let class = class_of(self.views[self.number(line, knot)]);
+            let class = self.class(line, knot);
             sights[line][knot].push(Sight { pass, seen: true, class });
         }
         for (line, knot) in &self.in_view {
@@ -303,7 +320,7 @@ impl<'a> Look<'a> {
             if self.sees_paint_beside(*line, *knot) {
                 elsewhere[*line][*knot] += 1;
             } else {
-                sights[*line][*knot].push(Sight { pass, seen: false, class: class_of(self.views[number]) });
+                sights[*line][*knot].push(Sight { pass, seen: false, class: self.class(*line, *knot) });
             }
         }
         for (line, knot) in self.in_view.drain(..) {
@@ -314,13 +331,21 @@ impl<'a> Look<'a> {
         }
     }
 
+    /// The class of how the pass had a knot in view.
+    fn class(&self, line: usize, knot: usize) -> usize {
+        class_of(self.views[self.number(line, knot)], self.double_lines.contain(line, knot))
+    }
+
     /// Whether the pass has the paint of a knot on another line.
     fn sees_paint_beside(&self, line: usize, knot: usize) -> bool {
         let place = self.lines.lines[line].points[knot];
         let normal = normal_of(&self.lines.lines[line].tangent(knot));
         let mut beside = false;
         self.lines.for_each_knot_near(&place, 3.0, |other, at, _| {
-            if beside || other == line || self.lines.are_old_and_new(line, other) {
+            let is_another = other == line
+                || self.lines.are_old_and_new(line, other)
+                || self.double_lines.are_two(line, knot, other);
+            if beside || is_another {
                 return;
             }
             let Some(witness) = self.own[self.number(other, at)] else { return };

@@ -7,7 +7,7 @@
 //! But where one of them went, or had not come yet, all passes have the same one. So passes that have one alone, one after
 //! the other in the order of time, become witnesses of the one beside which their mean lies.
 //!
-//! Not guaranteed: of a double line of which drives that were folded saw both, that it is one, until others did again.
+//! Not guaranteed: that a double line is known for one of which only folded drives had both, or fewer than so many passes.
 
 use std::{collections::BTreeMap, ops::Range};
 

@@ -8,7 +8,7 @@ use super::border::Crossing;
 use crate::{journal::cells::ContributionFact, session::SessionId};
 
 /// Raise it where the same contributions give another map: every cell is then fused again at the next start.
-const ALGORITHM: u32 = 15;
+const ALGORITHM: u32 = 16;
 
 /// Raise it where the bytes of contributions or of fused cells change: what an earlier build wrote is then written anew from
 /// the drives' snapshots.
